@@ -75,7 +75,7 @@ def remove_leftovers(*folders: Path) -> list[str]:
     for folder in folders:
         for path in folder.iterdir() if folder.is_dir() else ():
             match = _TEMPORARY.fullmatch(path.name)
-            if match is None or _is_alive(int(match[1])):
+            if match is None or is_alive(int(match[1])):
                 continue
             with suppress(OSError):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -83,7 +83,7 @@ def remove_leftovers(*folders: Path) -> list[str]:
     return [f"removed {count} unfinished file{'s'[: count > 1]} that a stopped call had left"] if count else []
 
 
-def _is_alive(process: int) -> bool:
+def is_alive(process: int) -> bool:
     """Return whether a process of this machine runs; where that cannot be asked, it does."""
     if sys.platform == "win32":
         return True

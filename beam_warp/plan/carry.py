@@ -33,7 +33,7 @@ from beam_warp.plan.steps import (
     worker_name,
     write_record,
 )
-from beam_warp.plan.workers import Outcome, Workers
+from beam_warp.plan.workers import Outcome, Workers, clear
 
 FOLDER, PLAN_NAME, STATE_NAME = "plan", "plan.json", "state.json"
 """Folder of what is known of a plan, in that of the job; its steps; and what became of them so far."""
@@ -111,6 +111,7 @@ class _Job:
     patience: Patience
     receipts: dict[str, Receipt] = field(default_factory=dict)
     running: dict[str, _Running] = field(default_factory=dict)
+    following: dict[str, tuple[Step, ...]] = field(default_factory=dict)
     hung: set[str] = field(default_factory=set)
     errors: dict[str, list[str]] = field(default_factory=dict)
     raised: dict[str, Exception] = field(default_factory=dict)
@@ -142,15 +143,17 @@ def carry_out(
     try:
         folder = plan.folder / FOLDER
         folder.mkdir(parents=True, exist_ok=True)
+        clear(plan.works)
         write_record(folder / PLAN_NAME, _as_record(plan))
         while not job.schedule.is_over:
             _hand_out(job)
+            _write_state(job)
             for outcome in workers.wait(_pause(job)):
                 _take(job, outcome, watch)
             _end_who_hang(job)
-            _write_state(job)
     finally:
         workers.close()
+        clear(plan.works)
         _write_state(job, is_last=True)
     _require_whole(job)
     return job.receipts
@@ -166,15 +169,16 @@ def _as_record(plan: Plan) -> dict[str, Any]:
 
 def _hand_out(job: _Job) -> None:
     """Give steps to idle workers."""
-    for _ in range(job.workers.idle()):
-        step = job.schedule.next()
+    for worker in job.workers.idle():
+        step = job.schedule.next(job.following.get(worker, ()))
         if step is None:
             return
-        following = job.schedule.likely_after(step) if job.workers.count == 1 else ()
+        following = job.following[worker] = job.schedule.likely_after(step)
         inputs = [(_folder(job, name), job.receipts[name]) for name in step.inputs]
         awaited = tuple(entry for folder, receipt in inputs for entry in awaited_files(folder, receipt))
         task = Task(step, tuple(receipt.key for _, receipt in inputs), awaited, following)
-        job.running[step.name] = _Running(job.workers.start(task), job.workers.now())
+        job.running[step.name] = _Running(worker, job.workers.now())
+        job.workers.start(worker, task)
 
 
 def _take(job: _Job, outcome: Outcome, watch: Watch) -> None:

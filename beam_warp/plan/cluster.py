@@ -96,15 +96,14 @@ class Cluster:
         self._most = len(plan.steps)
         self._grow()
 
-    def idle(self) -> int:
-        """Return how many actors have nothing to do and have said that they are ready."""
-        return sum(member.is_ready and member.task is None for member in self._members)
+    def idle(self) -> list[str]:
+        """Return the names of the actors that have nothing to do and have said that they are ready."""
+        return [member.name for member in self._members if member.is_ready and member.task is None]
 
-    def start(self, task: Task) -> str:
+    def start(self, name: str, task: Task) -> None:
         """Give a task to an idle actor."""
-        member = next(member for member in self._members if member.is_ready and member.task is None)
+        member = next(member for member in self._members if member.is_ready and member.name == name)
         member.task, member.reply = task, member.actor.attempt.remote(task)
-        return member.name
 
     def wait(self, seconds: float) -> list[Outcome]:
         """Return what was said, or lost, within a time."""

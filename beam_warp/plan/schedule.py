@@ -82,14 +82,21 @@ class Schedule:
         """Whether nothing can be done any more."""
         return not any(self.counts[state] for state in (State.READY, State.RUNNING))
 
-    def next(self) -> Step | None:
-        """Take the step to be done next; None where all that is left waits for others."""
-        while self._ready:
-            _, name = heapq.heappop(self._ready)
-            if self.states[name] is State.READY:
-                self._set(name, State.RUNNING)
-                return self.steps[name]
-        return None
+    def next(self, preferred: Iterable[Step] = ()) -> Step | None:
+        """Take the step to be done next; None where all that is left waits for others.
+
+        Args:
+            preferred: Steps that the worker has read ahead for: taken first, unless others have a higher rank.
+        """
+        while self._ready and self.states[self._ready[0][1]] is not State.READY:
+            heapq.heappop(self._ready)
+        if not self._ready:
+            return None
+        first = self.steps[self._ready[0][1]]
+        ahead = (step for step in preferred if self.states[step.name] is State.READY and step.rank >= first.rank)
+        step = next(ahead, first)
+        self._set(step.name, State.RUNNING)
+        return step
 
     def likely_after(self, step: Step) -> tuple[Step, ...]:
         """Return the steps that are likely to follow a running one: what waits for it alone, and one of the others."""

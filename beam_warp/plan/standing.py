@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from beam_warp.errors import InvalidOptionError
+from beam_warp.outputs import is_alive
 from beam_warp.plan.carry import FOLDER, PLAN_NAME, STATE_NAME
 from beam_warp.plan.schedule import Schedule
-from beam_warp.plan.steps import Receipt, Step, is_whole, read_receipt
+from beam_warp.plan.steps import Receipt, Step, is_whole, read_receipt, worker_name
 
 SILENCE = 15.0
-"""Time without a word after which who drives a plan is taken for gone [s]."""
+"""Time without a word after which who drives a plan on another machine is taken for gone [s]."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,8 @@ def look(folder: Path) -> Standing:
             f"{'is not there' if isinstance(error, OSError) else 'is damaged'}. Begin one with beam run."
         ) from error
     state = _state(place / STATE_NAME)
-    is_live = not state.get("is_over", True) and abs(time.time() - state.get("written", 0.0)) < SILENCE
+    silent = time.time() - state.get("written", 0.0)
+    is_live = not state.get("is_over", True) and _is_driven(str(state.get("driver", "")), silent)
     receipts = {}
     for step in steps:
         where, version = works[step.stage]
@@ -131,12 +133,20 @@ def look(folder: Path) -> Standing:
         steps,
         {stage: where for stage, (where, _) in works.items()},
         receipts,
-        {name: (worker, age) for name, (worker, age) in state.get("running", {}).items()} if is_live else {},
+        {name: (who, age + silent) for name, (who, age) in state.get("running", {}).items() if is_live},
         {name: tuple(words) for name, words in state.get("errors", {}).items() if name not in receipts},
         tuple(name for name in state.get("given_up", ()) if name not in receipts),
         int(state.get("workers", 1)),
         is_live,
     )
+
+
+def _is_driven(driver: str, silent: float) -> bool:
+    """Return whether a process still carries a plan out, which said so some time ago [s]."""
+    machine, _, number = driver.rpartition(":")
+    if machine == worker_name().rpartition(":")[0] and number.isdecimal():
+        return is_alive(int(number))
+    return abs(silent) < SILENCE
 
 
 def _state(path: Path) -> dict[str, Any]:

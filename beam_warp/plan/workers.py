@@ -24,7 +24,7 @@ from typing import Any, Protocol
 from beam_warp.digests import code_digest
 from beam_warp.errors import BeamError, InvalidOptionError, OutputError
 from beam_warp.jobs.listeners import NotedProgress, no_progress
-from beam_warp.outputs import remove_leftovers
+from beam_warp.outputs import remove_leftovers, temporary_path
 from beam_warp.plan.steps import Plan, Receipt, Task, Work, perform, worker_name
 
 OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
@@ -61,12 +61,12 @@ class Workers(Protocol):
 
     count: int
 
-    def idle(self) -> int:
-        """Return how many could be given a task."""
+    def idle(self) -> list[str]:
+        """Return the names of those who could be given a task."""
         ...
 
-    def start(self, task: Task) -> str:
-        """Give a task to an idle worker; return the worker's name."""
+    def start(self, name: str, task: Task) -> None:
+        """Give a task to an idle worker."""
         ...
 
     def wait(self, seconds: float) -> list[Outcome]:
@@ -100,14 +100,13 @@ class InProcess:
         self._works, self._progress = works, progress
         self._task: Task | None = None
 
-    def idle(self) -> int:
-        """Return 1, unless a task is to be done."""
-        return int(self._task is None)
+    def idle(self) -> list[str]:
+        """Return this process, unless a task is to be done."""
+        return [worker_name()] if self._task is None else []
 
-    def start(self, task: Task) -> str:
+    def start(self, name: str, task: Task) -> None:
         """Take a task, which `wait` does."""
         self._task = task
-        return worker_name()
 
     def wait(self, seconds: float) -> list[Outcome]:
         """Do the task."""
@@ -158,9 +157,9 @@ class Terms:
     @classmethod
     def of(cls, folder: Path, device: str) -> Terms:
         """Return what workers must have for work in a folder; the folder's token is made."""
-        name = f"shared-{os.urandom(8).hex()}"
-        (folder / name).touch()
-        return cls(str(folder), name, device, code_digest())
+        token = temporary_path(folder / "shared")
+        token.touch()
+        return cls(str(folder), token.name, device, code_digest())
 
     def withdraw(self) -> None:
         """Remove the token."""
@@ -235,17 +234,16 @@ class Processes:
             ) from error
         self._members = [self._member(setting) for setting in settings]
 
-    def idle(self) -> int:
-        """Return how many have nothing to do and have said that they are ready."""
-        return sum(member.is_ready and member.task is None for member in self._members)
+    def idle(self) -> list[str]:
+        """Return the names of those that have nothing to do and have said that they are ready."""
+        return [member.name for member in self._members if member.is_ready and member.task is None]
 
-    def start(self, task: Task) -> str:
+    def start(self, name: str, task: Task) -> None:
         """Give a task to an idle process."""
-        member = next(member for member in self._members if member.is_ready and member.task is None)
+        member = next(member for member in self._members if member.name == name)
         member.task = task
         with suppress(OSError):  # it has ended; `wait` finds out
             member.link.send(task)
-        return member.name
 
     def wait(self, seconds: float) -> list[Outcome]:
         """Return what was said, or ended, within a time."""
@@ -374,6 +372,11 @@ def prepare(works: Mapping[str, Work], terms: Terms) -> None:
         BeamError: It lacks something.
     """
     terms.require()
+    clear(works)
+
+
+def clear(works: Mapping[str, Work]) -> None:
+    """Remove what processes of this machine that have ended left half written."""
     for folder in {work.folder for work in works.values()}:
         remove_leftovers(folder, *filter(Path.is_dir, folder.iterdir()))
 

@@ -244,6 +244,7 @@ class FrameWork:
             return self._refine_rig(progress)
         if step.stage == "preview":
             write_png(self.store.preview_path(step.frame), self._preview(step.frame))
+            self._latest = None
             return {}
         self._latest = None
         views = self._images().views(step.frame)

@@ -181,7 +181,7 @@ class TestProcesses:
         receipts = carry_out(plan, processes(plan))
         assert outputs(tmp_path) == whole
         assert len({receipt.worker for receipt in receipts.values()}) == 2
-        assert not [path for path in tmp_path.iterdir() if path.name.startswith("shared-")]
+        assert not list(tmp_path.rglob(".*"))
 
     def test_faults_of_every_kind(self, tmp_path, whole):
         """Killed from outside, ended by what it does, hanging: each costs a try; who does so always is given up."""
