@@ -28,7 +28,7 @@ class ShowPlan:
     Example: beam plan walker --workers 8 --html walker.html
     """
 
-    out: Annotated[Positional[Path], arg(metavar="OUT", help="Folder of the job.")]
+    job: Annotated[Positional[Path], arg(metavar="OUT", help="Folder of the job.")]
     workers: Annotated[int | None, arg(metavar="N", help="Estimate for so many workers; else for those it has.")] = None
     html: Annotated[Path | None, arg(metavar="FILE", help="Also write a page: frames, times, errors, previews.")] = None
     json: Json = False
@@ -41,7 +41,7 @@ def plan(args: ShowPlan) -> int:
 
     if args.workers is not None:
         require_count("workers", args.workers, 1)
-    standing = look(args.out)
+    standing = look(args.job)
     if args.html is not None:
         write_page(standing, args.html)
     if args.json:

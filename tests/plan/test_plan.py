@@ -17,8 +17,9 @@ from support.toy_work import toy_plan
 
 from beam_warp.errors import InvalidOptionError, OutputError, UnfinishedError
 from beam_warp.plan.carry import Patience, carry_out
+from beam_warp.plan.page import left_in_words, write_page
 from beam_warp.plan.schedule import Schedule, State
-from beam_warp.plan.standing import look
+from beam_warp.plan.standing import look, simulated
 from beam_warp.plan.steps import Step, Task, is_whole, perform, read_receipt, wait_for
 from beam_warp.plan.workers import InProcess, Processes, Terms
 
@@ -67,6 +68,12 @@ class TestOrder:
             guessed = schedule.likely_after(step)
             schedule.done(step.name)
         assert not guessed
+
+    def test_a_worker_goes_on_with_what_it_has_read_unless_frames_can_be_finished(self):
+        schedule = Schedule([Step("a", "s", 0, (), 1), Step("b", "s", 1, (), 1), Step("c", "s", 2, (), 2)])
+        ahead = (schedule.steps["b"],)
+        assert [schedule.next(ahead).name for _ in range(3)] == ["c", "b", "a"]
+        assert schedule.next(ahead) is None
 
     @pytest.mark.parametrize("steps", [[Step("a", "s"), Step("a", "s")], [Step("a", "s", None, ("b",))]])
     def test_graphs_that_are_none(self, steps):
@@ -131,6 +138,46 @@ class TestKeys:
         (tmp_path / "out" / "materials-7.bin").unlink()
         here(plan)
         assert outputs(tmp_path) == whole
+
+
+class TestStanding:
+    def test_an_estimate_is_what_the_schedule_does(self, tmp_path):
+        """With one worker the sum of all steps; with many the longest way: cameras, five frames, materials."""
+        steps = toy_plan(tmp_path).steps
+        seconds = dict.fromkeys(("cameras", "frame", "light", "materials"), 1.0)
+        assert simulated(steps, (), seconds, 1) == len(steps) == 42
+        assert simulated(steps, (), seconds, 100) == 1 + 5 + 1
+        kept = [step.name for step in steps if step.stage != "materials"]
+        assert simulated(steps, kept, seconds, 4) == 20 / 4
+        assert simulated(steps, (), seconds | {"frame": 9.0}, 2) >= (42 + 20 * 8) / 2
+
+    def test_a_job_that_was_stopped(self, tmp_path):
+        plan = toy_plan(tmp_path, faults={"frame-3": "full"})
+        with pytest.raises(OutputError):
+            here(plan)
+        standing = look(tmp_path)
+        assert {stage: found.done for stage, found in standing.stages.items()} == {
+            **{"cameras": 1, "frame": 3, "materials": 3, "light": 1}
+        }
+        assert not standing.is_live
+        assert standing.seconds_left(2) < standing.seconds_left(1)
+        assert "34 of 42 steps are left: about" in left_in_words(standing)
+        (tmp_path / "out" / "frame-1.bin").unlink()
+        assert look(tmp_path).stages["frame"].done == 2
+
+    def test_a_page_shows_what_failed(self, tmp_path):
+        plan = toy_plan(tmp_path, 2, faults={"frame-1": "raise"})
+        with pytest.raises(UnfinishedError):
+            here(plan)
+        write_page(look(tmp_path), tmp_path / "page.html")
+        page = (tmp_path / "page.html").read_text()
+        assert "<li>frame-1: ValueError: a poisoned frame</li>" in page
+        assert page.count("<figure>") == 2
+        assert page.count("frame: failed") == page.count("materials: open") == 1
+
+    def test_no_plan(self, tmp_path):
+        with pytest.raises(InvalidOptionError, match=r"out must be the folder of a job .* is not there"):
+            look(tmp_path)
 
 
 class TestFaults:

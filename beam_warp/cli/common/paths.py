@@ -16,7 +16,7 @@ from beam_warp.converters.numbering import files_at
 from beam_warp.errors import BeamError, MissingFileError
 from beam_warp.outputs import ROOM, keep_original, kept_originals, originals_kept, require_apart
 
-OUTPUTS = ("out", "output", "renders", "sarif")
+OUTPUTS = ("out", "output", "renders", "sarif", "html")
 """Fields of commands' records that name what is written."""
 
 _WRITTEN = re.compile(
