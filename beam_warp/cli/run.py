@@ -23,7 +23,7 @@ from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
-    from beam_warp.reconstruction.job import FrameWork
+    from beam_warp.reconstruction.job import ReconstructionWork
     from beam_warp.world.gaussians import GaussianSequence
 
 
@@ -137,11 +137,11 @@ def _read(args: Run) -> GaussianSequence:
     return sequence if args.fps is None else replace(sequence, frames_per_second=args.fps)
 
 
-def _frame_work(args: Run, capture: Capture) -> FrameWork:
+def _frame_work(args: Run, capture: Capture) -> ReconstructionWork:
     from beam_warp.jobs.store import make_folders
-    from beam_warp.reconstruction.job import FrameWork
+    from beam_warp.reconstruction.job import ReconstructionWork
 
     steps = steps_of(args.modelling, capture, args.seed, args.device)
     options = options_of(args.modelling, capture)
     make_folders(args.out)
-    return FrameWork.prepare(capture, args.out / "reconstruction", steps, options)
+    return ReconstructionWork.prepare(capture, args.out / "reconstruction", steps, options)

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from beam_warp.capture.capture import Capture
-from beam_warp.reconstruction.job import FrameWork, frame_step
+from beam_warp.reconstruction.job import ReconstructionWork, frame_step
 from beam_warp.world.gaussians import GaussianSequence
 
 
@@ -112,7 +112,7 @@ class ReconstructedFrames:
     """
 
     are_made, have_images = False, True
-    work: FrameWork
+    work: ReconstructionWork
     frames_per_second: float | None
 
     def numbers(self) -> tuple[int, ...]:

@@ -37,7 +37,7 @@ from beam_warp.jobs.report import REPORT_NAME, write_report
 from beam_warp.plan.carry import Counted, carry_out
 from beam_warp.plan.steps import Receipt
 from beam_warp.plan.workers import Crew, in_process
-from beam_warp.reconstruction.job import FrameWork, Reconstruction
+from beam_warp.reconstruction.job import Reconstruction, ReconstructionWork
 from beam_warp.schema.staging import publish_asset, staged_folder
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
@@ -149,7 +149,11 @@ class TakeResult:
 
 
 def run_capture(
-    frames: FrameWork, work: MaterialWork, overview: OverviewOptions | None, started: float, crew: Crew = in_process
+    frames: ReconstructionWork,
+    work: MaterialWork,
+    overview: OverviewOptions | None,
+    started: float,
+    crew: Crew = in_process,
 ) -> TakeResult:
     """Reconstruct a capture and decompose it in one plan: the materials of a frame do not wait for all other frames.
 

@@ -137,7 +137,7 @@ def reconstruct(
         BeamError: An image is damaged, or a step refuses its input.
     """
     started = time.perf_counter()
-    work = FrameWork.prepare(capture, require_path("out", out), steps, options)
+    work = ReconstructionWork.prepare(capture, require_path("out", out), steps, options)
     plan = work.plan()
     with closing(work):
         receipts = carry_out(plan, crew(plan, work.device_kind, progress), Counted(plan, {"frame": "frames"}, progress))
@@ -145,7 +145,7 @@ def reconstruct(
 
 
 @dataclass(eq=False)
-class FrameWork:
+class ReconstructionWork:
     """Steps that find the Gaussians of every frame: ``cameras``, ``frame`` and ``preview``.
 
     Attributes:
@@ -167,7 +167,9 @@ class FrameWork:
     _latest: tuple[int, Sequence[CapturedView]] | None = None
 
     @classmethod
-    def prepare(cls, capture: Capture, out: Path, steps: FrameSteps, options: ReconstructOptions | None) -> FrameWork:
+    def prepare(
+        cls, capture: Capture, out: Path, steps: FrameSteps, options: ReconstructOptions | None
+    ) -> ReconstructionWork:
         """Check everything, and then make the folders."""
         chosen = options or ReconstructOptions()
         resolve_device(steps.device)

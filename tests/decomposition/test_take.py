@@ -18,7 +18,7 @@ from beam_warp.materials.direct import MaterialOptions
 from beam_warp.plan.crew import crew_of
 from beam_warp.plan.standing import look
 from beam_warp.plan.workers import Processes, in_process
-from beam_warp.reconstruction.job import FrameWork, ReconstructOptions
+from beam_warp.reconstruction.job import ReconstructionWork, ReconstructOptions
 from beam_warp.world.environment import EnvironmentMap
 
 OPTIONS = RunOptions(materials=MaterialOptions(sample_count=8), device="cpu")
@@ -26,7 +26,9 @@ OPTIONS = RunOptions(materials=MaterialOptions(sample_count=8), device="cpu")
 
 def take(capture, out, steps, length, crew=in_process, options=OPTIONS):
     out.mkdir()
-    frames = FrameWork.prepare(capture, out / "reconstruction", steps, ReconstructOptions(segment_length=length))
+    frames = ReconstructionWork.prepare(
+        capture, out / "reconstruction", steps, ReconstructOptions(segment_length=length)
+    )
     light = EnvironmentMap.read(capture.environment_path).resized(8, 16)
     work = MaterialWork(out, ReconstructedFrames(frames, None), light, options)
     return run_capture(frames, work, OverviewOptions(height=48), time.perf_counter(), crew)
