@@ -12,14 +12,14 @@ import statistics
 import time
 import traceback
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from beam_warp.errors import BeamError, InvalidOptionError, OutputError, UnfinishedError
-from beam_warp.jobs.listeners import NotedProgress
+from beam_warp.jobs.listeners import NotedProgress, no_progress
 from beam_warp.plan.schedule import Schedule, State
 from beam_warp.plan.steps import (
     Plan,
@@ -66,11 +66,8 @@ class Patience:
     factor: float = 10.0
 
 
-class Watch(Protocol):
-    """Hears what becomes of steps."""
-
-    def __call__(self, step: Step, receipt: Receipt | None, error: str) -> None:
-        """Take a step that is done, or was tried in vain."""
+Watch = Callable[[Step, Receipt | None, str], None]
+"""Called with a step that is done, its receipt and ""; or with one that was tried in vain, None and why."""
 
 
 class Counted:
@@ -121,7 +118,7 @@ class _Job:
 
 
 def carry_out(
-    plan: Plan, workers: Workers, watch: Watch = lambda *step: None, patience: Patience | None = None
+    plan: Plan, workers: Workers, watch: Watch = no_progress, patience: Patience | None = None
 ) -> dict[str, Receipt]:
     """Do every step of a plan that is not done.
 
