@@ -42,7 +42,9 @@ class Measuring:
         arg(metavar="STOPS|auto", help="Brighten the light by powers of two; auto where the colour has no scale."),
     ] = "auto"
     turn_light: Annotated[
-        bool, arg(help="Turn the light where the capture shows beyond doubt that it is askew by a few degrees.")
+        bool,
+        arg(help="Turn the light where the capture shows beyond doubt that it is askew by a few degrees."),
+        SECOND_PAGE,
     ] = True
     roughness: Annotated[
         float | Literal["estimate"] | Path | None,

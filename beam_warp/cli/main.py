@@ -44,7 +44,6 @@ class Command(NamedTuple):
 COMMANDS = {
     "run": Command("Run", "Make a relightable asset from Gaussians, or all the way from a capture."),
     "reconstruct": Command("Reconstruct", "Reconstruct a multi-view capture as Gaussians, tracked over time."),
-    "plan": Command("ShowPlan", "Say how far a long job is: frames done, running, left, failed, and an estimate."),
     "decompose": Command("Decompose", "Find materials of Gaussians, from the images that they were fitted to."),
     "render": Command("Render", "Relight assets: an image, numbered images or a film."),
     "channel": Command("DrawChannel", "Draw one array of an asset without light: materials, errors, flags."),
@@ -55,6 +54,7 @@ COMMANDS = {
     "stability": Command("Stability", "Run what tracing, reconstruction, materials and relighting may fail on."),
     "chart": Command("Chart", "Measure error against time on your own data and device."),
     "inspect": Command("Inspect", "Say what is wrong with a capture before hours are spent on it."),
+    "plan": Command("ShowPlan", "Say how far a long job is: frames done, running, left, failed, and an estimate."),
 }
 
 MOVED = {("render", "--channel"): "beam channel ASSET NAME --out FILE"}
