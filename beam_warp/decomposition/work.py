@@ -35,12 +35,9 @@ from beam_warp.materials.direct import ColorEvidence
 from beam_warp.materials.roughness import RoughnessEstimate
 from beam_warp.materials.roughness_source import RoughnessTexture, stated_roughness
 from beam_warp.outputs import remove_leftovers
-from beam_warp.plan.steps import Plan, Step, Task
+from beam_warp.plan.steps import Plan, Rank, Step, Task
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.environment import EnvironmentMap
-
-LIGHT_RANK, MATERIALS_RANK = 9, 2
-"""Nothing comes before the light; materials of a frame come before another frame."""
 
 STAGES = ("light", "roughness", "materials")
 
@@ -86,15 +83,15 @@ class MaterialWork:
         """Return the steps."""
         numbers = self.frames.numbers()
         made = [self.frames.step(number) for number in numbers]
-        steps, shared = [Step("light", "light", None, made[0], LIGHT_RANK)], ("light",)
+        steps, shared = [Step("light", "light", None, made[0], Rank.SHARED)], ("light",)
         if self.options.roughness == ESTIMATE and self._may_be_persistent:
             inputs = ("light", *(name for names in made for name in names))
-            steps.append(Step("roughness", "roughness", None, inputs, LIGHT_RANK))
+            steps.append(Step("roughness", "roughness", None, inputs, Rank.SHARED))
             shared = (*shared, "roughness")
         for index, number in enumerate(numbers):
             before = (material_step(numbers[index - 1]),) if index and self._follows else ()
             inputs = (*shared, *made[index], *before)
-            steps.append(Step(material_step(number), "materials", number, inputs, MATERIALS_RANK))
+            steps.append(Step(material_step(number), "materials", number, inputs, Rank.MATERIALS))
         return Plan(self.folder, tuple(steps), dict.fromkeys(STAGES, self))
 
     @property

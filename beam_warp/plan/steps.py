@@ -15,6 +15,7 @@ import platform
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,6 +31,16 @@ PATIENCE = 30.0
 """Time after which a file that another machine wrote must be visible here [s]; NFS caches names for 30 s at most."""
 
 
+class Rank(IntEnum):
+    """Which of several steps is done first: the highest, so that frames are finished before others are begun."""
+
+    KEY_FRAME = 0
+    TRACKED_FRAME = 1
+    MATERIALS = 2
+    PREVIEW = 3
+    SHARED = 4
+
+
 @dataclass(frozen=True)
 class Step:
     """A piece of work that is done as a whole, by one worker.
@@ -39,14 +50,14 @@ class Step:
         stage: Kind of step; steps of a stage take about as long.
         frame: Number of the frame that it is about; None for what is done once for all, without which nothing goes on.
         inputs: Names of the steps whose outputs it reads.
-        rank: Steps of a higher rank are done first: those that finish frames come before those that start them.
+        rank: Steps of a higher rank are done first; see `Rank`.
     """
 
     name: str
     stage: str
     frame: int | None = None
     inputs: tuple[str, ...] = ()
-    rank: int = 0
+    rank: int = Rank.KEY_FRAME
 
 
 class Work(Protocol):

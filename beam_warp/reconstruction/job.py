@@ -43,7 +43,7 @@ from beam_warp.image.files import write_png
 from beam_warp.jobs.listeners import NotedProgress, no_progress
 from beam_warp.jobs.report import REPORT_NAME, device_facts, versions, write_json, write_report
 from beam_warp.plan.carry import Counted, carry_out
-from beam_warp.plan.steps import Plan, Receipt, Step, Task
+from beam_warp.plan.steps import Plan, Rank, Receipt, Step, Task
 from beam_warp.plan.workers import Crew, in_process
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.frames.model import model_frame, within
@@ -58,9 +58,6 @@ from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
 
 ASSET_NAME = "gaussians.usda"
-
-PREVIEW_RANK, CAMERAS_RANK = 3, 9
-"""Previews come before other frames, while their images are at hand; nothing comes before cameras."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,15 +181,16 @@ class ReconstructionWork:
         first = ()
         steps: list[Step] = []
         if self.options.cameras == "refine" and _is_fixed_rig(self.frames.records):
-            steps.append(Step("cameras", "cameras", rank=CAMERAS_RANK))
+            steps.append(Step("cameras", "cameras", rank=Rank.SHARED))
             first = ("cameras",)
         else:
             (self.folder / FILE_NAME).unlink(missing_ok=True)
         for segment in self.frames.segments:
             for frame, previous in zip(segment, (None, *segment), strict=False):
                 inputs = first if previous is None else (frame_step(previous),)
-                steps.append(Step(frame_step(frame), "frame", frame, inputs, int(previous is not None)))
-                steps.append(Step(f"preview-{frame:06d}", "preview", frame, (frame_step(frame),), PREVIEW_RANK))
+                rank = Rank.KEY_FRAME if previous is None else Rank.TRACKED_FRAME
+                steps.append(Step(frame_step(frame), "frame", frame, inputs, rank))
+                steps.append(Step(f"preview-{frame:06d}", "preview", frame, (frame_step(frame),), Rank.PREVIEW))
         return Plan(self.folder, tuple(steps), dict.fromkeys(("cameras", "frame", "preview"), self))
 
     @property
@@ -289,7 +287,7 @@ class ReconstructionWork:
         """Fit or track a frame and store it."""
         assert step.frame is not None
         before = None
-        if step.rank:
+        if step.rank == Rank.TRACKED_FRAME:
             order = tuple(self.frames.records)
             previous = order[order.index(step.frame) - 1]
             track = self.steps.restore(self.store.track_arrays(previous))
