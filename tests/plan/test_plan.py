@@ -142,7 +142,7 @@ class TestKeys:
 
 class TestStanding:
     def test_an_estimate_is_what_the_schedule_does(self, tmp_path):
-        """With one worker the sum of all steps; with many the longest way: cameras, five frames, materials."""
+        """One worker takes the sum of all steps; many take the longest way: cameras, five frames, materials."""
         steps = toy_plan(tmp_path).steps
         seconds = dict.fromkeys(("cameras", "frame", "light", "materials"), 1.0)
         assert simulated(steps, (), seconds, 1) == len(steps) == 42
