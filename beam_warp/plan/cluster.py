@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
 import socket
 import time
 from collections.abc import Mapping
@@ -17,8 +16,8 @@ from contextlib import suppress
 from typing import Any
 
 from beam_warp.errors import BeamError, InvalidOptionError, MissingPackageError
-from beam_warp.plan.steps import Plan, Task, Work
-from beam_warp.plan.workers import Crew, Outcome, Terms, attempt, prepare, worker_name
+from beam_warp.plan.steps import Plan, Task, Work, worker_name
+from beam_warp.plan.workers import Crew, Outcome, Terms, attempt, packed, unpacked
 
 LOOK_PERIOD = 5.0
 """How often machines are counted [s]."""
@@ -87,7 +86,7 @@ class Cluster:
                 f"workers must name a Ray cluster that runs, got none at {address} ({reason}). Start it by ray start."
             ) from error
         self._terms = Terms.of(plan.folder, kind)
-        self._packed = pickle.dumps((dict(plan.works), self._terms))
+        self._packed = packed(plan.works, self._terms)
         needs = {"num_gpus": 1} if kind == "cuda" else {"num_cpus": 1}
         self._actor = ray.remote(**needs, max_restarts=0, max_task_retries=0)(_Actor)
         self._members: list[_Member] = []
@@ -187,23 +186,17 @@ class _Member:
 class _Actor:
     """What runs in the cluster."""
 
-    def __init__(self, packed: bytes, kind: str) -> None:
+    def __init__(self, content: bytes, kind: str) -> None:
         if kind == "cpu":
             os.environ["BEAM_WARP_THREADS"] = "1"  # it has been given one core
-        self._packed = packed
+        self._content = content
         self._works: Mapping[str, Work] = {}
 
     def prepare(self) -> str | BeamError:
         try:
-            self._works, terms = pickle.loads(self._packed)
-            prepare(self._works, terms)
+            self._works = unpacked(self._content)
         except BeamError as error:
             return error
-        except Exception as error:
-            return InvalidOptionError(
-                f"workers must be able to do such work, got {type(error).__name__} ({error}) on {worker_name()}. "
-                "Install the same packages there."
-            )
         return worker_name()
 
     def attempt(self, task: Task) -> Outcome:

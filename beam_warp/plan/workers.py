@@ -226,12 +226,7 @@ class Processes:
         self.count = len(settings)
         self._terms = terms
         self._context = multiprocessing.get_context("spawn")
-        try:
-            self._works = pickle.dumps((dict(works), terms))
-        except (pickle.PicklingError, TypeError, AttributeError) as error:
-            raise InvalidOptionError(
-                f"work must be picklable to be sent to other processes, got {error}. Pass paths, or use one process."
-            ) from error
+        self._packed = packed(works, terms)
         self._members = [self._member(setting) for setting in settings]
 
     def idle(self) -> list[str]:
@@ -282,7 +277,7 @@ class Processes:
         process.start()
         there.close()
         with suppress(OSError):
-            here.send_bytes(self._works)
+            here.send_bytes(self._packed)
         return _Member(process, here, setting)
 
     def _hear(self, member: _Member) -> list[Outcome]:
@@ -343,11 +338,10 @@ def _serve(link: Any, setting: Mapping[str, str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver hears it, and ends this process
     os.environ.update(setting)
     tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    packed = link.recv_bytes()
+    content = link.recv_bytes()
     threading.Thread(target=_listen, args=(link, tasks), daemon=True).start()
-    works, terms = pickle.loads(packed)
     try:
-        prepare(works, terms)
+        works = unpacked(content)
     except BeamError as error:
         link.send(error)
         return
@@ -365,14 +359,37 @@ def _listen(link: Any, tasks: queue.SimpleQueue[Any]) -> None:
         os._exit(1)
 
 
-def prepare(works: Mapping[str, Work], terms: Terms) -> None:
-    """Make a worker ready: check what it must have, and remove what killed processes of this machine have left.
+def packed(works: Mapping[str, Work], terms: Terms) -> bytes:
+    """Return what a worker is sent first.
+
+    Raises:
+        InvalidOptionError: The work cannot be sent to another process.
+    """
+    try:
+        return pickle.dumps((terms, pickle.dumps(dict(works))))
+    except (pickle.PicklingError, TypeError, AttributeError) as error:
+        raise InvalidOptionError(
+            f"work must be picklable to be sent to other processes, got {error}. Pass paths, or use one process."
+        ) from error
+
+
+def unpacked(content: bytes) -> dict[str, Work]:
+    """Return what a worker does, once it is known to have all that is needed; what others here left is removed.
 
     Raises:
         BeamError: It lacks something.
     """
+    terms, work = pickle.loads(content)
     terms.require()
+    try:
+        works = pickle.loads(work)
+    except Exception as error:
+        raise InvalidOptionError(
+            f"workers must be able to do such work, got {type(error).__name__} ({error}) on {worker_name()}. Install the "
+            "same packages there."
+        ) from error
     clear(works)
+    return works
 
 
 def clear(works: Mapping[str, Work]) -> None:
