@@ -385,8 +385,8 @@ def unpacked(content: bytes) -> dict[str, Work]:
         works = pickle.loads(work)
     except Exception as error:
         raise InvalidOptionError(
-            f"workers must be able to do such work, got {type(error).__name__} ({error}) on {worker_name()}. Install the "
-            "same packages there."
+            f"workers must be able to do such work, got {type(error).__name__} ({error}) on {worker_name()}. "
+            "Install the same packages there."
         ) from error
     clear(works)
     return works
