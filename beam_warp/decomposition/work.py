@@ -76,7 +76,7 @@ class MaterialWork:
                 "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
             )
         if self.frames.are_made:
-            _ = self.images  # refuses a capture that lacks a frame
+            _ = self.frames.sequence(), self.images  # refuses what cannot be read, and a capture that lacks a frame
         return remove_leftovers(self.folder, *make_folders(self.folder, "frames", "digests"))
 
     def plan(self) -> Plan:
