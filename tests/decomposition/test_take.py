@@ -47,7 +47,7 @@ def ball(tmp_path_factory):
     return Capture.read(write_capture(tmp_path_factory.mktemp("captures") / "ball", (2, 3, 4, 5)))
 
 
-@pytest.mark.parametrize(("length", "topology"), [(2, "perFrame"), (0, "constant")])
+@pytest.mark.parametrize(("length", "topology"), [(2, "perFrame"), pytest.param(0, "constant", marks=pytest.mark.slow)])
 def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
     one = take(ball, tmp_path / "one", FakeSteps(), length)
     two = take(ball, tmp_path / "two", FakeSteps(), length, crew_of("2", "cpu"))
