@@ -21,19 +21,19 @@ so that a job that was stopped anywhere continues to the same bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture, CaptureRecord
-from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
+from beam_warp.capture.corrections import FILE_NAME, read_corrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
@@ -83,6 +83,29 @@ class ReconstructOptions:
             raise InvalidOptionError(
                 f"frames must be ascending and each there once, got {str(self.frames)[:60]}. Sort them."
             )
+
+
+Records = Mapping[int, Sequence[CaptureRecord]]
+
+
+class Mend(NamedTuple):
+    """Something that is found wrong with a capture in its first frame, and is put right in all.
+
+    What is found has ``corrected(records)``, ``capture(capture)``, ``findings()`` and ``as_dict()``.
+
+    Attributes:
+        stage: Name of its step, of the option by which it is left out ("keep"), and of its entry in the report.
+        file: Name of the file that holds what was found.
+        read: Returns what that file of a folder says; None if there is none.
+        find: Called with the steps of a frame, names of the cameras, their views and progress; None for nothing.
+        is_possible: Whether it can be found in records of these frames.
+    """
+
+    stage: str
+    file: str
+    read: Callable[[Path], Any]
+    find: Callable[..., Any]
+    is_possible: Callable[[Records], bool]
 
 
 @dataclass(frozen=True)
@@ -143,7 +166,7 @@ def reconstruct(
 
 @dataclass(eq=False)
 class ReconstructionWork:
-    """Steps that find the Gaussians of every frame: ``cameras``, ``frame`` and ``preview``.
+    """Steps that find the Gaussians of every frame: those of `MENDS`, ``frame`` and ``preview``.
 
     Attributes:
         capture: Images and cameras.
@@ -178,20 +201,21 @@ class ReconstructionWork:
 
     def plan(self) -> Plan:
         """Return the steps; a frame follows the one before in its segment, and the first ones the cameras."""
-        first = ()
+        first: tuple[str, ...] = ()
         steps: list[Step] = []
-        if self.options.cameras == "refine" and _is_fixed_rig(self.frames.records):
-            steps.append(Step("cameras", "cameras", rank=Rank.SHARED))
-            first = ("cameras",)
-        else:
-            (self.folder / FILE_NAME).unlink(missing_ok=True)
+        for mend in MENDS:
+            if mend in self.mends:
+                steps.append(Step(mend.stage, mend.stage, None, first, Rank.SHARED))
+                first = (mend.stage,)
+            else:
+                (self.folder / mend.file).unlink(missing_ok=True)
         for segment in self.frames.segments:
             for frame, previous in zip(segment, (None, *segment), strict=False):
                 inputs = first if previous is None else (frame_step(previous),)
                 rank = Rank.KEY_FRAME if previous is None else Rank.TRACKED_FRAME
                 steps.append(Step(frame_step(frame), "frame", frame, inputs, rank))
                 steps.append(Step(f"preview-{frame:06d}", "preview", frame, (frame_step(frame),), Rank.PREVIEW))
-        return Plan(self.folder, tuple(steps), dict.fromkeys(("cameras", "frame", "preview"), self))
+        return Plan(self.folder, tuple(steps), dict.fromkeys((step.stage for step in steps), self))
 
     @property
     def device_kind(self) -> str:
@@ -204,16 +228,21 @@ class ReconstructionWork:
         return FrameStore(self.folder)
 
     @cached_property
-    def rig(self) -> RigCorrection | None:
-        """What was found about the cameras; None for nothing, or before it was sought."""
-        return read_corrections(self.folder)
+    def mends(self) -> tuple[Mend, ...]:
+        """What is asked for and can be found."""
+        asked = (mend for mend in MENDS if getattr(self.options, mend.stage) != "keep")
+        return tuple(mend for mend in asked if mend.is_possible(self.frames.records))
 
     @cached_property
-    def records(self) -> Mapping[int, Sequence[CaptureRecord]]:
-        """Records of each frame, cameras corrected."""
-        if self.rig is None:
-            return self.frames.records
-        return {frame: self.rig.corrected(found) for frame, found in self.frames.records.items()}
+    def found(self) -> dict[str, Any]:
+        """What was found wrong with the capture, by stage, when all of it has been sought."""
+        read = {mend.stage: mend.read(self.folder) for mend in self.mends}
+        return {stage: found for stage, found in read.items() if found is not None}
+
+    @cached_property
+    def records(self) -> Records:
+        """Records of each frame, with all that was found put right."""
+        return _corrected(self.frames.records, self.found.values())
 
     def common(self) -> str:
         """Return all that every step depends on."""
@@ -225,23 +254,24 @@ class ReconstructionWork:
 
     def digest(self, step: Step) -> str:
         """Return the digest of a frame's records and images; a preview has those of its frame."""
-        if step.stage == "cameras":
-            frame = next(iter(self.frames.records))
+        if step.frame is None:
             with FrameReader(self.frames.records, self.store.digests) as reader:
-                return reader.digest(frame)
-        return self._images().digest(step.frame) if step.stage == "frame" and step.frame is not None else ""
+                return reader.digest(next(iter(self.frames.records)))
+        return self._images().digest(step.frame) if step.stage == "frame" else ""
 
     def outputs(self, step: Step) -> tuple[Path, ...]:
-        """Return the file of a step; there is none about cameras in which nothing was found."""
+        """Return the file of a step; there is none where nothing was found wrong."""
         if step.frame is None:
-            return tuple(filter(Path.is_file, [self.folder / FILE_NAME]))
+            return tuple(
+                path for mend in MENDS if mend.stage == step.stage and (path := self.folder / mend.file).is_file()
+            )
         return ((self.store.path if step.stage == "frame" else self.store.preview_path)(step.frame),)
 
     def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
-        """Find cameras, model a frame, or draw its preview."""
+        """Find what is wrong with the capture, model a frame, or draw its preview."""
         step = task.step
         if step.frame is None:
-            return self._refine_rig(progress)
+            return self._mend(step.stage, progress)
         if step.stage == "preview":
             write_png(self.store.preview_path(step.frame), self._preview(step.frame))
             self._latest = None
@@ -271,16 +301,19 @@ class ReconstructionWork:
             self._reader = FrameReader(self.records, self.store.digests)
         return self._reader
 
-    def _refine_rig(self, progress: NotedProgress) -> dict[str, Any]:
-        """Find what is wrong with the cameras."""
-        frame, records = next(iter(self.frames.records.items()))
-        with FrameReader(self.frames.records, self.store.digests) as reader:
-            names = [record.camera_name for record in records]
-            found = self.steps.refine_rig(names, reader.views(frame), within(progress, "cameras", frame))
+    def _mend(self, stage: str, progress: NotedProgress) -> dict[str, Any]:
+        """Find something wrong with the capture, what was found before it put right."""
+        place = [mend.stage for mend in self.mends].index(stage)
+        mend, frame = self.mends[place], next(iter(self.frames.records))
+        known = filter(None, (before.read(self.folder) for before in self.mends[:place]))
+        records = _corrected({frame: self.frames.records[frame]}, known)
+        with FrameReader(records, self.store.digests) as reader:
+            names = [record.camera_name for record in records[frame]]
+            found = mend.find(self.steps, names, reader.views(frame), within(progress, stage, frame))
         if found is None:
-            (self.folder / FILE_NAME).unlink(missing_ok=True)
+            (self.folder / mend.file).unlink(missing_ok=True)
         else:
-            write_json(self.folder / FILE_NAME, found.as_dict())
+            write_json(self.folder / mend.file, found.as_dict())
         return {}
 
     def _model(self, step: Step, views: Sequence[CapturedView], progress: NotedProgress) -> dict[str, Any]:
@@ -323,7 +356,7 @@ class ReconstructionWork:
 
     def seen(self) -> Capture:
         """Return the capture with the cameras that the Gaussians are fitted with."""
-        return self.capture if self.rig is None else self.rig.capture(self.capture)
+        return reduce(lambda capture, found: found.capture(capture), self.found.values(), self.capture)
 
     def finish(self, receipts: Mapping[str, Receipt], started: float, progress: NotedProgress) -> Reconstruction:
         """Write asset and report of a plan that was carried out, begun at a time [s]."""
@@ -340,7 +373,7 @@ class ReconstructionWork:
         records = self.records
         made = {frame: receipts[frame_step(frame)] for frame in records}
         frames = [{**self.store.report(frame), "seconds": receipt.seconds} for frame, receipt in made.items()]
-        findings = (*self.frames.findings, *(() if self.rig is None else self.rig.findings()))
+        findings = [*self.frames.findings, *(said for found in self.found.values() for said in found.findings())]
         return {
             "input": {
                 "capture": str(self.capture.folder),
@@ -353,10 +386,10 @@ class ReconstructionWork:
             "options": {
                 **self.steps.options(),
                 "segment_length": self.options.segment_length,
-                "cameras": self.options.cameras,
+                **{mend.stage: getattr(self.options, mend.stage) for mend in MENDS},
             },
             "resumed_frames": sum(receipt.is_kept for receipt in made.values()),
-            "cameras": None if self.rig is None else self.rig.as_dict(),
+            **{mend.stage: self.found[mend.stage].as_dict() if mend.stage in self.found else None for mend in MENDS},
             **sequence_facts(frames),
             "findings": [vars(finding) for finding in findings],
             "warnings": [*self.notes, *(finding.what for finding in findings), *warnings_of(frames)],
@@ -379,3 +412,14 @@ def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
             if not np.array_equal(first.camera_to_world, record.camera.camera_to_world):
                 return False
     return True
+
+
+MENDS = (Mend("cameras", FILE_NAME, read_corrections, lambda steps, *asked: steps.refine_rig(*asked), _is_fixed_rig),)
+"""What is put right, in this order: each step sees the capture as those before it left it."""
+
+
+def _corrected(records: Records, found: Iterable[Any]) -> Records:
+    """Return records with all that was found put right."""
+    for one in found:
+        records = {frame: one.corrected(rows) for frame, rows in records.items()}
+    return records
