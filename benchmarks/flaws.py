@@ -18,7 +18,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -26,10 +26,12 @@ from typing import Any
 
 import numpy as np
 import record
+from numpy.typing import NDArray
 from parts import Row
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
+from beam_warp.capture.corrections import RigCorrection, move_between, read_corrections
 from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
 from beam_warp.cli.reconstruct import Modelling
@@ -43,11 +45,13 @@ from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.rig import in_gauge, pixels_of
 from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.stability.capture_cases.case import Detection, detections_of, in_words
 from beam_warp.stability.flaws.write import FLAWS, STUDIO, FlawedCapture, write_flawed
 from beam_warp.study.materials import without_color
 from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
@@ -111,7 +115,10 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     said = [*reconstruction["findings"], *decomposition["findings"]]
     said += [finding for frame in reconstruction["frames"] for finding in frame["findings"]]
     row |= told(copy, name, [Finding(**finding) for finding in said])
+    rig = read_corrections(out / "reconstruction")
+    surface = converters.read(out / "asset.usda")[0]
     row["recovered"] = recovered(copy, reconstruction, decomposition)
+    row["recovered"] |= recovered_poses(clean, copy.capture, rig, change_axes(surface, "rfu").positions)
     row["gaussians"] = decomposition["input"]["gaussians"]
     evaluated = time.perf_counter()
     sequence = in_units_of(converters.read(out / "asset.usda"), copy.white)
@@ -157,6 +164,46 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
         "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
     }
+
+
+def recovered_poses(
+    clean: Capture, copy: Capture, rig: RigCorrection | None, surface: NDArray[np.floating]
+) -> dict[str, float]:
+    """Return how far cameras are from the true ones as the copy states them, and as they were found.
+
+    A motion and a scale of the world, which no photograph tells, are taken out first: those of least squares in pixels.
+
+    Args:
+        clean: The capture with the true cameras.
+        copy: The flawed copy.
+        rig: What was found; None for nothing.
+        surface: Points of the subject [m], ``(N, 3)``.
+
+    Returns:
+        Root mean squares over the cameras that are left: ``pose_pixels`` of what moves in the image, and ``pose_mm`` of
+        the camera's place, both with ``_injected``, too; how far the world was moved by that, ``gauge_mm``.
+    """
+    true = {entry.camera_name: entry.camera for entry in clean.select(split="train")}
+    records = copy.select(split="train")
+    found = {entry.camera_name: entry.camera for entry in (records if rig is None else rig.corrected(records))}
+    given = {entry.camera_name: entry.camera for entry in records if entry.camera_name in found}
+    result = {}
+    for ending, cameras in (("_injected", given), ("", found)):
+        pixels, metres, world = apart([true[name] for name in cameras], list(cameras.values()), surface)
+        result |= {f"pose_pixels{ending}": pixels, f"pose_mm{ending}": 1e3 * metres}
+        result[f"gauge_mm{ending}"] = 1e3 * float(np.linalg.norm(world[3:6]))
+    return result
+
+
+def apart(
+    true: Sequence[Camera], found: Sequence[Camera], surface: NDArray[np.floating]
+) -> tuple[float, float, NDArray[np.float64]]:
+    """Return how far cameras are from true ones, in the image [pixel] and in place [m], and the world's motion."""
+    points = surface[:: max(1, len(surface) // 500)].astype(np.float64)
+    moves = np.array([[*move_between(*pair), 0.0, 0.0] for pair in zip(true, found, strict=True)])
+    moves, world = in_gauge(true, moves, points, ("turn", "shift"))
+    pixels = [pixels_of(*pair, points) for pair in zip(true, moves, strict=True)]
+    return float(np.sqrt(np.mean(np.square(pixels)))), float(np.sqrt(np.square(moves[:, 3:6]).sum(1).mean())), world
 
 
 def in_units_of(sequence: GaussianSequence, white: float) -> GaussianSequence:
