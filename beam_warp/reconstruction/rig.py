@@ -139,26 +139,23 @@ def refine_rig(
     steps = _Steps(progress, sum(level.total for level in (*coarse, finest)) * len(views))
     fitter = RigFitter(views, given, finest, options, target, steps)
     fitter.settle(finest.warm)
-    if not fitter.kinds:
+    if not (fitter.kinds or fitter.behind().any()):
         return judged(names, given, fitter)
-    if coarse and fitter.is_far():
+    if coarse and (fitter.is_far() or fitter.behind().any()):
         cameras = given
         for level in coarse:
             fitter = RigFitter(views, cameras, level, options, target, steps)
             fitter.settle(level.warm)
-            fitter.refine()
-            cameras = fitter.cameras
+            cameras = fitter.refine()
         fitter = RigFitter(views, cameras, finest, options, target, steps)
         fitter.settle(finest.warm)
     fitter.refine()
-    psnr = fitter.psnr()
-    is_bad = psnr < np.nanmedian(psnr) - MOST_BEHIND
+    is_bad = fitter.behind()
     if is_bad.any():  # it has misled the others
-        others = [k for k in range(len(views)) if not is_bad[k]]
+        others, psnr = np.flatnonzero(~is_bad), fitter.psnr()
         kept = [names[k] for k in others]
         rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
-        bad = {name: float(psnr[k]) for k, name in enumerate(names) if is_bad[k]}
-        return _left_out(bad, kept, rest)
+        return _left_out({names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad)}, kept, rest)
     return judged(names, given, fitter)
 
 
@@ -244,11 +241,9 @@ class RigFitter(Fitter):
         if not self.kinds:
             self.kinds = wrong_kinds(self.found)
 
-    def refine(self) -> None:
-        """Move cameras and fit Gaussians in turns, until steps are within their errors."""
-        for _ in range(self._level.rounds):
-            if not self.kinds:
-                return
+    def refine(self) -> list[Camera]:
+        """Move cameras and fit Gaussians in turns, until steps are within their errors; return the cameras."""
+        for _ in range(self._level.rounds if self.kinds else 0):
             steps = self.steps()
             for view, step in enumerate(steps):
                 self._move(view, OVERSTEP * step)
@@ -256,8 +251,14 @@ class RigFitter(Fitter):
             if self._is_settled(steps):
                 more = wrong_kinds(self.found, self.kinds)
                 if more == self.kinds:
-                    return
+                    break
                 self.kinds = more
+        return self.cameras
+
+    def behind(self) -> NDArray[np.bool_]:
+        """Return which photographs are met much worse than the others, ``(V,)``."""
+        psnr = self.psnr()
+        return psnr < np.nanmedian(psnr) - MOST_BEHIND
 
     def steps(self) -> list[NDArray[np.float64]]:
         """Return what the photographs say is wrong with each camera, ``(11,)`` each."""
@@ -349,15 +350,15 @@ def in_gauge(
         The corrections, ``(V, 11)``, and what was undone: turn [rad], shift [m] and the logarithm of scale, ``(7,)``.
     """
     chosen, center = rows_of(kinds), points.mean(axis=0)
+    result = moves.copy()
+    result[:, 6] -= moves[:, 6].mean()  # first: the world's scale does nearly the same
     flows = [flow_of(camera, points).reshape(NUMBERS, -1).T for camera in given]
     worlds = [part @ _world_motion(camera, center) for part, camera in zip(flows, given, strict=True)]
-    seen = np.concatenate([part @ move for part, move in zip(flows, moves, strict=True)])
+    seen = np.concatenate([part @ move for part, move in zip(flows, result, strict=True)])
     world = np.linalg.lstsq(np.concatenate(worlds), seen, rcond=None)[0]
-    result = moves.copy()
     for row, part, effect in zip(result, flows, worlds, strict=True):
         if len(part):
             row[chosen] -= np.linalg.lstsq(part[:, chosen], effect @ world, rcond=None)[0]
-    result[:, 6] -= result[:, 6].mean()
     return result, world
 
 
