@@ -390,6 +390,7 @@ def judged(names: Sequence[str], given: Sequence[Camera], fitter: RigFitter) -> 
         moves = np.array([[*move_between(*pair), 0.0, 0.0] for pair in zip(given, fitter.cameras, strict=True)])
     else:
         moves = np.stack([found.solved(kinds)[0] for found in fitter.found])
+    moves[:, ~np.isin(np.arange(NUMBERS), rows_of(kinds))] = 0.0  # but for rounding
     moves, world = in_gauge(given, moves, points, kinds)
     covariances = [found.solved(kinds)[1] for found in fitter.found]
     moved = np.array([pixels_of(*pair, points) for pair in zip(given, moves, strict=True)])

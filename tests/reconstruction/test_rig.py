@@ -68,7 +68,8 @@ def test_a_rig_s_own_corrections_stay(points):
 
 def test_turns_alone_have_no_shift_to_undo_the_world_with(rng, points):
     cameras = cameras_around(12)
-    moves = moves_of(cameras, shaken(rng, cameras, 1.0))
+    moves = np.zeros((12, 11))
+    moves[:, :3] = 0.01 * rng.normal(size=(12, 3))
     found, _ = in_gauge(cameras, moves, points, ["turn"])
     np.testing.assert_array_equal(found[:, 3:], 0.0)
 
