@@ -39,24 +39,24 @@ class CameraCorrection:
         turn: Rotation vector in the camera's axes (right, down, forward) [rad], ``(3,)``.
         shift: Shift in the same axes [m], ``(3,)``: a point p in them comes to be at turn(p) + shift.
         log_focal: Natural logarithm of the factor of both focal lengths.
-        center: Way of the principal point, right and down [focal length], ``(2,)``.
         pixels: How far this moves the surface in the image, root mean square [pixel].
         error: Standard error of that [pixel].
-        place_error: Standard error with which the image tells the camera's place, were it asked for [m].
         psnr: Quality that the camera's image was met with [dB].
         is_used: False for a camera that could not be reconciled with the others, and is left out.
+        center: Way of the principal point, right and down [focal length], ``(2,)``.
+        place_error: Standard error with which the images tell the camera's place, whether it is moved or not [m].
     """
 
     camera: str
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     log_focal: float = 0.0
-    center: tuple[float, float] = (0.0, 0.0)
     pixels: float = 0.0
     error: float = 0.0
-    place_error: float = 0.0
     psnr: float = 0.0
     is_used: bool = True
+    center: tuple[float, float] = (0.0, 0.0)
+    place_error: float = 0.0
 
     def __post_init__(self) -> None:
         """Check every number once: they come from files too."""
@@ -177,9 +177,9 @@ class RigCorrection:
         try:
             cameras = tuple(CameraCorrection(**camera) for camera in content["cameras"])
             confidence = require_number("confidence", content["confidence"], 0.0)
-            world = require_array("world", content["world"], (7,), np.float64)
+            world = require_array("world", content.get("world", (0.0,) * 7), (7,), np.float64)
             require_finite("world", world)
-            kinds = tuple(str(kind) for kind in content["kinds"])
+            kinds = tuple(str(kind) for kind in content.get("kinds", ()))
             return cls(cameras, bool(content["is_applied"]), confidence, kinds, tuple(world.tolist()))
         except (BeamError, KeyError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())

@@ -447,7 +447,9 @@ class TestCameras:
 
     def test_a_rig_that_moves_is_taken_as_it_is(self, capture, steps, tmp_path):
         moved = [
-            replace(record, camera=moved_camera(record.camera, [0.0] * 5 + [0.1, 0.0])) if record.frame else record
+            replace(record, camera=moved_camera(record.camera, [0.0] * 5 + [0.1, *[0.0] * 3]))
+            if record.frame
+            else record
             for record in capture.records
         ]
         reconstruct(Capture(**{**vars(capture), "records": tuple(moved)}), tmp_path / "out", steps, BEGINNING)
