@@ -49,7 +49,7 @@ CERTAIN = 1.5
 """Corrections that are so many times their standard errors, root mean square over the rig, are made. In exact rigs that
 is about 1, by what the errors are."""
 
-CERTAIN_ALONE = 4.0
+CERTAIN_ALONE = 6.0
 """Those of one camera alone are made from here on."""
 
 MOST_BEHIND = 6.0
