@@ -7,7 +7,7 @@ corrected: a rig's mean holds the world in its place, and what is rendered for o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -72,6 +72,10 @@ class CameraCorrection:
         ):
             require_number(name, getattr(self, name), low, high)
 
+    def summary(self) -> str:
+        """Return how far the camera was moved, and how sure that is, in a few characters."""
+        return f"{self.pixels:.2f} ± {self.error:.2f} px" if self.is_used else "contradicts"
+
     def applied(self, camera: Camera) -> Camera:
         """Return the corrected camera."""
         return moved_camera(camera, (*self.turn, *self.shift, self.log_focal, *self.center))
@@ -95,6 +99,18 @@ class RigCorrection:
     confidence: float
     kinds: tuple[str, ...] = ()
     world: tuple[float, ...] = (0.0,) * 7
+
+    def ways(self, cameras: Mapping[str, Camera], point: ArrayLike) -> dict[str, NDArray[np.float64]]:
+        """Return which way corrections move a point in the images of cameras that were moved [pixel], ``(2,)`` each.
+
+        Args:
+            cameras: Cameras as they are stated, by name.
+            point: A point of the subject [m], ``(3,)``.
+        """
+        where = np.asarray(point, np.float64)[None]
+        moved = [camera for camera in self.cameras if camera.camera in cameras and camera.is_used and self.is_applied]
+        pairs = {camera.camera: (cameras[camera.camera], camera.applied(cameras[camera.camera])) for camera in moved}
+        return {name: (after.project(where) - before.project(where))[0, :2] for name, (before, after) in pairs.items()}
 
     @property
     def pixels(self) -> float:
@@ -124,6 +140,15 @@ class RigCorrection:
     def capture(self, capture: Capture) -> Capture:
         """Return the capture with its training cameras corrected."""
         return Capture(**{**vars(capture), "records": self.corrected(capture.records)})
+
+    def summary(self) -> str:
+        """Return what was moved, and how sure that is, in one line."""
+        known = f"{self.pixels:.2f} ± {self.error:.2f} pixels"
+        if not self.is_applied:
+            return f"cameras agree to {known}, and are as stated"
+        place = 1e3 * _root_mean_square([camera.place_error for camera in self.cameras])
+        told = f"; images tell places to ± {place:.1f} mm" if place else ""
+        return f"cameras moved by {known} ({', '.join(self.kinds)}){told}"
 
     def findings(self) -> list[Finding]:
         """Return what a user should know about the cameras."""

@@ -97,7 +97,7 @@ class Evidence:
         information = fields.sum(axis=0)
         size = np.sqrt(np.diag(information))
         surplus = len(self.scores) - len(chosen)
-        if not (surplus > 0 and size.all()):
+        if not (len(chosen) and surplus > 0 and size.all()):
             return numbers, covariance
         inverse = np.linalg.pinv(information / np.outer(size, size), rcond=1e-9, hermitian=True) / np.outer(size, size)
         solution = inverse @ self.scores[:, chosen].sum(axis=0)
@@ -110,7 +110,8 @@ class Evidence:
 
 def rows_of(kinds: Collection[str]) -> NDArray[np.int64]:
     """Return the places of the numbers of some kinds, in their order."""
-    return np.concatenate([np.arange(NUMBERS)[part] for kind, part in KINDS.items() if kind in kinds])
+    chosen = [np.arange(NUMBERS)[part] for kind, part in KINDS.items() if kind in kinds]
+    return np.concatenate([np.zeros(0, int), *chosen])
 
 
 def evidence(
@@ -124,7 +125,7 @@ def evidence(
         depth: Of what was drawn, along the optical axis [m], ``(H, W)``.
         camera: The camera, of that size.
     """
-    rows, columns = np.gradient(np.asarray(drawn, np.float64), axis=(0, 1))
+    rows, columns = (np.gradient(np.asarray(drawn, np.float64), axis=axis) for axis in range(2))
     away = np.asarray(photograph, np.float64) - drawn
     depth = _spread(np.asarray(depth, np.float64), drawn[..., -1] > SEEN)
     lengths = np.sqrt(np.mean(away * away, axis=2))

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from beam_warp import converters
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
+from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
@@ -49,6 +50,7 @@ from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
 from beam_warp.reconstruction.frames.store import FrameStore, common_inputs, key_of_frame, stored_cloud, stored_sequence
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
+from beam_warp.reconstruction.rig import FEWEST_CAMERAS
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
@@ -226,7 +228,8 @@ def _prepare(
     rig = _refined_rig(job, out) if options.cameras == "refine" else None
     if rig is None:
         (out / FILE_NAME).unlink(missing_ok=True)
-        return job
+        kept = (_why_kept(plan.records),) if options.cameras == "refine" else ()
+        return replace(job, plan=replace(plan, findings=(*plan.findings, *kept)))
     records = {frame: rig.corrected(found) for frame, found in plan.records.items()}
     return replace(job, rig=rig, plan=replace(plan, records=records, findings=(*plan.findings, *rig.findings())))
 
@@ -247,6 +250,20 @@ def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
             if known is not None:
                 write_json(out / FILE_NAME, {"key": key, **known.as_dict()})
     return known
+
+
+def _why_kept(records: Mapping[int, Sequence[CaptureRecord]]) -> Finding:
+    """Say why nothing is known about the cameras of a capture."""
+    count = len(next(iter(records.values())))
+    if not _is_fixed_rig(records):
+        why = "they move, or several have one name"
+    elif count < FEWEST_CAMERAS:
+        why = (
+            f"{FEWEST_CAMERAS} are needed to tell which one is wrong, and there {'is' if count == 1 else 'are'} {count}"
+        )
+    else:
+        why = "images without masks do not tell where they look"
+    return Finding("note", "cameras-kept", f"cameras are taken as they are stated: {why}")
 
 
 def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:

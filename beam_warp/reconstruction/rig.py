@@ -59,7 +59,7 @@ OVERSTEP = 1.6
 """Steps over what photographs say: Gaussians that were fitted to a photograph have followed its camera a part of
 the way."""
 
-SETTLED = 0.3
+SETTLED = 0.5
 """Rounds end when steps are so much smaller than the standard errors."""
 
 FAR = 1.0
@@ -139,6 +139,8 @@ def refine_rig(
     steps = _Steps(progress, sum(level.total for level in (*coarse, finest)) * len(views))
     fitter = RigFitter(views, given, finest, options, target, steps)
     fitter.settle(finest.warm)
+    if not fitter.kinds and fitter.behind().any():
+        fitter.settle(finest.total)  # it may only not be there yet
     if not (fitter.kinds or fitter.behind().any()):
         return judged(names, given, fitter)
     if coarse and (fitter.is_far() or fitter.behind().any()):
@@ -152,10 +154,10 @@ def refine_rig(
     fitter.refine()
     is_bad = fitter.behind()
     if is_bad.any():  # it has misled the others
-        others, psnr = np.flatnonzero(~is_bad), fitter.psnr()
+        others, psnr = np.flatnonzero(~is_bad).tolist(), fitter.psnr()
         kept = [names[k] for k in others]
         rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
-        return _left_out({names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad)}, kept, rest)
+        return _left_out({names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad).tolist()}, kept, rest)
     return judged(names, given, fitter)
 
 
@@ -359,7 +361,7 @@ def in_gauge(
     for row, part, effect in zip(result, flows, worlds, strict=True):
         if len(part):
             row[chosen] -= np.linalg.lstsq(part[:, chosen], effect @ world, rcond=None)[0]
-    return result, world
+    return result, world.astype(np.float64)
 
 
 def _world_motion(camera: Camera, center: NDArray[np.float64]) -> NDArray[np.float64]:

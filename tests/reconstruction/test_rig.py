@@ -98,6 +98,7 @@ def test_chance_is_no_kind_and_what_is_wrong_is_named(rng, points):
     both = none.copy()
     both[:, 0], both[:, 6] = 0.01 * rng.normal(size=(2, 12))
     assert wrong_kinds(says(rng, points, both, 0.1), ["turn"]) == ("turn", "focal")
+    np.testing.assert_array_equal(says(rng, points, both, 0.1)[0].solved([])[0], 0.0)
     one = none.copy()
     one[3, 1] = 0.02
     assert wrong_kinds(says(rng, points, one, 0.1)) == ("turn",)
