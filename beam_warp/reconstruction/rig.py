@@ -14,7 +14,8 @@ A capture's cameras are never exact, and a fit pays for each tenth of a pixel. W
 4. The gauge is the rig's: of all corrections that a motion and a scale of the world explain, none is left, and the mean
    factor of the focal lengths is 1. So renders for other cameras are where they were. Then each camera's correction
    shrinks by what chance explains of it (James and Stein).
-5. A camera whose photograph is met much worse than the others' is left out and named, and all begins again without it.
+5. A camera whose photograph is met much worse than the others', or whose silhouette contradicts theirs where something
+   is wrong, is left out and named, and all begins again without it. More than a third are refused.
 
 A turn and a shift sideways look the same but for depth: an error of a part of a pixel that a view's surface shares is
 one of millimetres in place. So an error of place is mended by a turn, until the photographs tell the two apart, and
@@ -32,8 +33,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.corrections import CameraCorrection, RigCorrection, move_between, moved_camera
+from beam_warp.capture.findings import names_of
+from beam_warp.capture.silhouettes import contradicting
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
+from beam_warp.errors import AssetFormatError, InvalidArrayError
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction.alignment import NUMBERS, Evidence, evidence, flow_of, rows_of, strength
 from beam_warp.reconstruction.fit import FitOptions, Fitter
@@ -54,6 +58,9 @@ CERTAIN_ALONE = 6.0
 
 MOST_BEHIND = 6.0
 """A camera whose photograph is met by so much less than the middle one's is left out [dB]."""
+
+MOST_LEFT_OUT = 1.0 / 3.0
+"""Part of a rig that may be left out: of more, nothing tells who is right."""
 
 OVERSTEP = 1.6
 """Steps over what photographs say: Gaussians that were fitted to a photograph have followed its camera a part of
@@ -129,36 +136,57 @@ def refine_rig(
         Corrections; None where there are fewer than `FEWEST_CAMERAS`, or a view has no mask.
 
     Raises:
-        InvalidArrayError: The masks have no volume in common.
+        InvalidArrayError: The masks have no volume in common, and no few of them are to blame.
+        AssetFormatError: Too many cameras contradict the others.
         DeviceError: There is no such device.
     """
     if len(views) < FEWEST_CAMERAS or any(view.alpha is None for view in views):
         return None
-    target, given = resolve_device(device), [view.camera for view in views]
-    *coarse, finest = levels_of(given)
+    given, fitter = [view.camera for view in views], None
+    try:
+        fitter = _fitted(views, options, resolve_device(device), progress)
+        is_bad = fitter.contradicting(views)
+    except InvalidArrayError:  # the masks share no volume
+        is_bad = contradicting(views)
+        if not is_bad.any():
+            raise
+    if fitter is not None and not is_bad.any():
+        return judged(names, given, fitter)
+    psnr = np.zeros(len(views)) if fitter is None else np.nan_to_num(fitter.psnr())
+    bad = {names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad).tolist()}
+    if len(bad) > MOST_LEFT_OUT * len(views):
+        raise AssetFormatError(
+            f"cameras must show one subject from where they are stated, got {len(bad)} of {len(views)} that contradict "
+            f"the others at {names_of(bad)}. Check that no two captures are mixed, and the calibration."
+        )
+    others = np.flatnonzero(~is_bad).tolist()  # they were misled
+    kept = [names[k] for k in others]
+    rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
+    return _left_out(bad, kept, rest)
+
+
+def _fitted(views: Sequence[CapturedView], options: FitOptions, device: Any, progress: StepProgress) -> RigFitter:
+    """Return the finest level after its last look, from coarser ones where cameras are far off."""
+    cameras = [view.camera for view in views]
+    *coarse, finest = levels_of(cameras)
     steps = _Steps(progress, sum(level.total for level in (*coarse, finest)) * len(views))
-    fitter = RigFitter(views, given, finest, options, target, steps)
+    fitter = RigFitter(views, cameras, finest, options, device, steps)
     fitter.settle(finest.warm)
     if not fitter.kinds and fitter.behind().any():
         fitter.settle(finest.total)  # it may only not be there yet
-    if not (fitter.kinds or fitter.behind().any()):
-        return judged(names, given, fitter)
-    if coarse and (fitter.is_far() or fitter.behind().any()):
-        cameras = given
-        for level in coarse:
-            fitter = RigFitter(views, cameras, level, options, target, steps)
-            fitter.settle(level.warm)
-            cameras = fitter.refine()
-        fitter = RigFitter(views, cameras, finest, options, target, steps)
-        fitter.settle(finest.warm)
+    if not (fitter.is_far() or fitter.behind().any()):
+        fitter.refine()
+        return fitter
+    if contradicting(views).any():  # which misleads the others, and is no matter of pixels
+        return fitter
+    for level in coarse:
+        fitter = RigFitter(views, cameras, level, options, device, steps)
+        fitter.settle(level.warm)
+        cameras = fitter.refine()
+    fitter = RigFitter(views, cameras, finest, options, device, steps)
+    fitter.settle(finest.warm)
     fitter.refine()
-    is_bad = fitter.behind()
-    if is_bad.any():  # it has misled the others
-        others, psnr = np.flatnonzero(~is_bad).tolist(), fitter.psnr()
-        kept = [names[k] for k in others]
-        rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
-        return _left_out({names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad).tolist()}, kept, rest)
-    return judged(names, given, fitter)
+    return fitter
 
 
 class _Steps:
@@ -261,6 +289,11 @@ class RigFitter(Fitter):
         """Return which photographs are met much worse than the others, ``(V,)``."""
         psnr = self.psnr()
         return psnr < np.nanmedian(psnr) - MOST_BEHIND
+
+    def contradicting(self, views: Sequence[CapturedView]) -> NDArray[np.bool_]:
+        """Return which of all views contradict the others, by what they show or where it ends, ``(V,)``."""
+        is_behind = self.behind()
+        return is_behind | contradicting(views) if is_behind.any() or self.is_far() else is_behind
 
     def steps(self) -> list[NDArray[np.float64]]:
         """Return what the photographs say is wrong with each camera, ``(11,)`` each."""

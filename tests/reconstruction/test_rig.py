@@ -145,7 +145,7 @@ def test_moved_cameras_of_a_ball_come_nearer_with_the_same_bits(device, monkeypa
 
 def test_a_sound_rig_stays_to_the_bit_after_one_look(device, monkeypatch):
     monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 4, 1, 1),))
-    monkeypatch.setattr(rig.RigFitter, "refine", None)
+    monkeypatch.setattr(rig.RigFitter, "_move", None)
     views = ball_views(cameras_around(6, 40))
     found = refine_rig([f"c{k}" for k in range(6)], views, FitOptions.of_preset("draft"), device=device)
     assert found is not None
