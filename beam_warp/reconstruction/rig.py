@@ -72,6 +72,9 @@ SETTLED = 0.5
 FAR = 1.0
 """Steps beyond this are taken at a coarser level first [pixel of the level]."""
 
+WORST_ERROR = 1.0
+"""Where standard errors are larger than this over a rig, photographs contradict each other [pixel]."""
+
 FEWER_POINTS = 23
 """Every so many Gaussians are asked how far they move in an image: hundreds do."""
 
@@ -174,7 +177,7 @@ def _fitted(views: Sequence[CapturedView], options: FitOptions, device: Any, pro
     fitter.settle(finest.warm)
     if not fitter.kinds and fitter.behind().any():
         fitter.settle(finest.total)  # it may only not be there yet
-    if not (fitter.is_far() or fitter.behind().any()):
+    if not fitter.is_lost():
         fitter.refine()
         return fitter
     if contradicting(views).any():  # which misleads the others, and is no matter of pixels
@@ -292,8 +295,11 @@ class RigFitter(Fitter):
 
     def contradicting(self, views: Sequence[CapturedView]) -> NDArray[np.bool_]:
         """Return which of all views contradict the others, by what they show or where it ends, ``(V,)``."""
-        is_behind = self.behind()
-        return is_behind | contradicting(views) if is_behind.any() or self.is_far() else is_behind
+        return self.behind() | (contradicting(views) if self.is_lost() else False)
+
+    def is_lost(self) -> bool:
+        """Tell whether a camera is too far off, or too little is known, for steps to lead anywhere."""
+        return self.is_far() or bool(self.behind().any()) or _root_mean_square(self.errors()) > WORST_ERROR
 
     def steps(self) -> list[NDArray[np.float64]]:
         """Return what the photographs say is wrong with each camera, ``(11,)`` each."""
@@ -313,11 +319,15 @@ class RigFitter(Fitter):
         """Tell whether steps were within their errors."""
         points = self.surface()
         moved = [pixels_of(*pair, points) for pair in zip(self.cameras, steps, strict=True)]
-        errors = [
-            error_of(camera, found.solved(self.kinds)[1], points)
+        return _root_mean_square(moved) < SETTLED * _root_mean_square(self.errors())
+
+    def errors(self) -> list[float]:
+        """Return how well each photograph tells what is moved of its camera [pixel]."""
+        points, kinds = self.surface(), self.kinds or MOVED_KINDS[:1]
+        return [
+            error_of(camera, found.solved(kinds)[1], points)
             for camera, found in zip(self.cameras, self.found, strict=True)
         ]
-        return _root_mean_square(moved) < SETTLED * _root_mean_square(errors)
 
     def _evidence(self, view: int) -> Evidence:
         """Return what a photograph says about its camera, in numbers of the photograph's own size."""

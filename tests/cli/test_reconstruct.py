@@ -1,16 +1,20 @@
 """`beam reconstruct`, and `beam run` of a capture: what they write and say, and one clear line for each mistake."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.commands import beam
 from support.fake_steps import FakeSteps, write_capture
+from support.moving_ball import ball_views, rig
 
 from beam_warp.capture.capture import Capture
+from beam_warp.capture.corrections import moved_camera
 from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of
 from beam_warp.cli.run import capture_at
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
+from beam_warp.image.files import write_exr
 
 
 @pytest.fixture(scope="module")
@@ -169,3 +173,42 @@ def test_the_walker(data_dir, asked, tmp_path, capsys):
     assert report["input"]["cameras"] == 24
     assert np.isfinite(report["mean_psnr"])
     assert len(Capture.read(walker).select(split="train", frames=[0])) == report["input"]["cameras"]
+
+
+class TestContradictions:
+    """Cameras that do not show one subject are named in one line, before hours are spent on them."""
+
+    @staticmethod
+    def write(folder, views):
+        """Write cut-outs and their cameras as a capture of one frame."""
+        folder.mkdir()
+        records = []
+        for k, view in enumerate(views):
+            path = f"{k}.exr"
+            write_exr(folder / path, {"RGBA"[i]: view.color[..., i] for i in range(3)} | {"A": view.alpha})
+            pose = view.camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
+            records.append({"file_path": path, "camera": f"c{k}", "frame": 0, "transform_matrix": pose.tolist()})
+        camera = views[0].camera
+        content = {"w": camera.width, "h": camera.height, "fl_x": camera.focal_x, "fl_y": camera.focal_y}
+        content |= {"cx": camera.center_x, "cy": camera.center_y, "frames": records}
+        (folder / "transforms.json").write_text(json.dumps(content))
+        return folder
+
+    @pytest.mark.parametrize("case", ["mixed", "contradicting"])
+    def test_the_culprits_are_named(self, case, tmp_path, capsys):
+        cameras = rig(11, 64)
+        views = ball_views(cameras)
+        if case == "mixed":  # with a capture of another place, by the same cameras
+            others = ball_views(cameras, center=(0.0, 0.0, 0.6))
+            views = [others[k] if k in (1, 4, 6, 8) else view for k, view in enumerate(views)]
+        else:
+            turned = {1: 0.18, 4: -0.18, 6: 0.2, 8: -0.2}
+            views = [
+                replace(view, camera=moved_camera(view.camera, [turned.get(k, 0.0), *[0.0] * 8]))
+                for k, view in enumerate(views)
+            ]
+        words = ("reconstruct", self.write(tmp_path / case, views), "--out", tmp_path / "out", "--device", "cpu")
+        assert beam(*words, "--gaussians", 500, "--preset", "draft", "--quiet") == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert "got 4 of 11 that contradict the others at c1, c4, c6, c8. Check that no two captures are mixed" in line
+        assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
