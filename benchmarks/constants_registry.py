@@ -324,13 +324,23 @@ MATERIALS = (
     *(
         Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, EXACT_RIGS)
         for name, does in (
-            ("OWN_ERROR", "Correction that may be the method's own error [pixel]."),
-            ("FREEDOM", "Independent numbers that an image tells of its camera."),
-            ("FIELD", "Side of the fields that are fitted apart [pixel]."),
+            ("CERTAIN", "Corrections of a rig that are made [standard error]."),
+            ("CERTAIN_ALONE", "Those of one camera alone [standard error]."),
             ("MOST_BEHIND", "How much worse a camera that is left out is met [dB]."),
-            ("SHIFT_SHARE", "Steps of shifts over those of turns."),
-            ("MOMENTS", "Decay of the moments of a camera's steps."),
-            ("FAR", "Move after which a level is taken again [pixel]."),
+            ("OVERSTEP", "Steps over what photographs say."),
+            ("SETTLED", "Steps that end the rounds [standard error]."),
+            ("FAR", "Step that is taken at a coarser level first [pixel of the level]."),
+            ("WORST_ERROR", "Standard error from which silhouettes are asked [pixel]."),
+            ("POOR", "Quality below which silhouettes are asked [dB]."),
+        )
+    ),
+    *(
+        Constant(f"beam_warp.reconstruction.alignment:{name}", "walker, runner, robot", does, EXACT_RIGS)
+        for name, does in (
+            ("FIELD", "Side of the fields whose scores are told apart [pixel]."),
+            ("OUTLIER", "Differences beyond it count by their sign [robust standard deviation]."),
+            ("SEEN", "Coverage of a pixel that has a depth of its own."),
+            ("MODEL_ERROR", "Standard errors over what the scatter of fields says."),
         )
     ),
     *(
@@ -425,7 +435,7 @@ UNTUNED = {
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
         beam_warp.materials.light_turn: TURNS
-        beam_warp.reconstruction.rig: CHANCE FOCAL_EDGE
+        beam_warp.reconstruction.rig: MOST_LEFT_OUT
         beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
@@ -456,8 +466,9 @@ UNTUNED = {
         beam_warp.reconstruction.gains: LARGEST_SIDE MOST_POINTS DARKEST ROUNDS SETTLED
         beam_warp.reconstruction.hull: MIN_RESOLUTION MAX_RESOLUTION SEARCH_BLOCKS SEARCH_ROUNDS ENOUGH SEARCH_SIDE
         beam_warp.reconstruction.hull: DISTANCE_LIMIT
-        beam_warp.reconstruction.rig: FEWEST_CAMERAS MOST_REPEATS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
+        beam_warp.reconstruction.rig: FEWEST_CAMERAS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
         beam_warp.reconstruction.rig: SHORTEST_SIDE
+        beam_warp.reconstruction.alignment: NUMBERS
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING

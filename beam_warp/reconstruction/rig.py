@@ -75,6 +75,9 @@ FAR = 1.0
 WORST_ERROR = 1.0
 """Where standard errors are larger than this over a rig, photographs contradict each other [pixel]."""
 
+POOR = 20.0
+"""Where the middle photograph is met by less, silhouettes are asked whether they are of one subject [dB]."""
+
 FEWER_POINTS = 23
 """Every so many Gaussians are asked how far they move in an image: hundreds do."""
 
@@ -181,6 +184,9 @@ def _fitted(views: Sequence[CapturedView], options: FitOptions, device: Any, pro
         fitter.refine()
         return fitter
     if contradicting(views).any():  # which misleads the others, and is no matter of pixels
+        return fitter
+    if not (fitter.is_far() or fitter.behind().any()):
+        fitter.refine()
         return fitter
     for level in coarse:
         fitter = RigFitter(views, cameras, level, options, device, steps)
@@ -299,7 +305,8 @@ class RigFitter(Fitter):
 
     def is_lost(self) -> bool:
         """Tell whether a camera is too far off, or too little is known, for steps to lead anywhere."""
-        return self.is_far() or bool(self.behind().any()) or _root_mean_square(self.errors()) > WORST_ERROR
+        is_poor = float(np.nanmedian(self.psnr())) < POOR
+        return is_poor or self.is_far() or bool(self.behind().any()) or _root_mean_square(self.errors()) > WORST_ERROR
 
     def steps(self) -> list[NDArray[np.float64]]:
         """Return what the photographs say is wrong with each camera, ``(11,)`` each."""
