@@ -31,7 +31,8 @@ NUMBERS = 11
 """Numbers of all kinds."""
 
 FIELD = 24
-"""Side of the fields of pixels whose scores are told apart [pixel]: about twice the window of structural similarity."""
+"""Side of the fields of pixels whose scores are told apart [pixel]: about twice the window of structural similarity. In
+small images it is a third of the shorter side."""
 
 OUTLIER = 1.5
 """Differences beyond so many robust standard deviations count by their sign only."""
@@ -133,9 +134,10 @@ def evidence(
     weights = np.minimum(1.0, limit / np.maximum(lengths, 1e-12)) if limit > 0.0 else np.ones_like(lengths)
     informations, scores = [], []
     places = np.mgrid[: depth.shape[0], : depth.shape[1]][::-1] + 0.5
-    for top in range(0, depth.shape[0], FIELD):
-        for left in range(0, depth.shape[1], FIELD):
-            part = np.s_[top : top + FIELD, left : left + FIELD]
+    side = int(np.clip(min(depth.shape) // 3, 4, FIELD))
+    for top in range(0, depth.shape[0], side):
+        for left in range(0, depth.shape[1], side):
+            part = np.s_[top : top + side, left : left + side]
             if not (rows[part].any() or columns[part].any()):
                 continue
             moves = flow(camera, depth[part], places[:, *part])[:, :, ..., None]

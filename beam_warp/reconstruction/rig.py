@@ -143,7 +143,7 @@ def refine_rig(
 
     Raises:
         InvalidArrayError: The masks have no volume in common, and no few of them are to blame.
-        AssetFormatError: Too many cameras contradict the others.
+        AssetFormatError: Too many cameras contradict the others, or nothing tells which ones do.
         DeviceError: There is no such device.
     """
     if len(views) < FEWEST_CAMERAS or any(view.alpha is None for view in views):
@@ -157,7 +157,7 @@ def refine_rig(
         if not is_bad.any():
             raise
     if fitter is not None and not is_bad.any():
-        return judged(names, given, fitter)
+        return _credible(judged(names, given, fitter))
     psnr = np.zeros(len(views)) if fitter is None else np.nan_to_num(fitter.psnr())
     bad = {names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad).tolist()}
     if len(bad) > MOST_LEFT_OUT * len(views):
@@ -169,6 +169,18 @@ def refine_rig(
     kept = [names[k] for k in others]
     rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
     return _left_out(bad, kept, rest)
+
+
+def _credible(found: RigCorrection) -> RigCorrection:
+    """Return corrections, unless the photographs contradict each other too much to tell them."""
+    if found.is_applied and found.error > WORST_ERROR:
+        worst = max(found.cameras, key=lambda camera: camera.pixels)
+        raise AssetFormatError(
+            f"cameras must agree on one subject, got corrections of {found.pixels:.1f} ± {found.error:.1f} pixels, "
+            f"most at {worst.camera}. Check that no two captures are mixed, and the calibration; or keep the cameras as "
+            "they are stated."
+        )
+    return found
 
 
 def _fitted(views: Sequence[CapturedView], options: FitOptions, device: Any, progress: StepProgress) -> RigFitter:

@@ -196,10 +196,10 @@ class TestContradictions:
 
     @pytest.mark.parametrize("case", ["mixed", "contradicting"])
     def test_the_culprits_are_named(self, case, tmp_path, capsys):
-        cameras = rig(11, 64)
+        cameras = rig(11, 48)
         views = ball_views(cameras)
         if case == "mixed":  # with a capture of another place, by the same cameras
-            others = ball_views(cameras, center=(0.0, 0.0, 0.6))
+            others = ball_views(cameras, center=(0.3, 0.3, 0.3))
             views = [others[k] if k in (1, 4, 6, 8) else view for k, view in enumerate(views)]
         else:
             turned = {1: 0.18, 4: -0.18, 6: 0.2, 8: -0.2}
@@ -211,4 +211,5 @@ class TestContradictions:
         assert beam(*words, "--gaussians", 500, "--preset", "draft", "--quiet") == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert "got 4 of 11 that contradict the others at c1, c4, c6, c8. Check that no two captures are mixed" in line
-        assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+        kept = [path.parent.name for path in (tmp_path / "out").rglob("*") if path.is_file()]
+        assert set(kept) <= {"digests"}  # which a second call need not make again
