@@ -327,6 +327,7 @@ MATERIALS = (
             ("CERTAIN", "Corrections of a rig that are made [standard error]."),
             ("CERTAIN_ALONE", "Those of one camera alone [standard error]."),
             ("MOST_BEHIND", "How much worse a camera that is left out is met [dB]."),
+            ("ALIKE", "Quality of a photograph that is not left out [dB]."),
             ("OVERSTEP", "Steps over what photographs say."),
             ("SETTLED", "Steps that end the rounds [standard error]."),
             ("FAR", "Step that is taken at a coarser level first [pixel of the level]."),

@@ -59,6 +59,9 @@ CERTAIN_ALONE = 6.0
 MOST_BEHIND = 6.0
 """A camera whose photograph is met by so much less than the middle one's is left out [dB]."""
 
+ALIKE = 25.0
+"""A photograph that is met by more than this is of the subject, however much better others are met [dB]."""
+
 MOST_LEFT_OUT = 1.0 / 3.0
 """Part of a rig that may be left out: of more, nothing tells who is right."""
 
@@ -158,7 +161,7 @@ def refine_rig(
             raise
     if fitter is not None and not is_bad.any():
         return _credible(judged(names, given, fitter))
-    psnr = np.zeros(len(views)) if fitter is None else np.nan_to_num(fitter.psnr())
+    psnr = np.zeros(len(views)) if fitter is None else np.nan_to_num(fitter.quality)
     bad = {names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad).tolist()}
     if len(bad) > MOST_LEFT_OUT * len(views):
         raise AssetFormatError(
@@ -177,8 +180,8 @@ def _credible(found: RigCorrection) -> RigCorrection:
         worst = max(found.cameras, key=lambda camera: camera.pixels)
         raise AssetFormatError(
             f"cameras must agree on one subject, got corrections of {found.pixels:.1f} ± {found.error:.1f} pixels, "
-            f"most at {worst.camera}. Check that no two captures are mixed, and the calibration; or keep the cameras as "
-            "they are stated."
+            f"most at {worst.camera}. Check that no two captures are mixed, and the calibration; or keep the cameras "
+            "as they are stated."
         )
     return found
 
@@ -250,6 +253,7 @@ class RigFitter(Fitter):
         cameras: The cameras so far, of the photographs' own size.
         kinds: Kinds of numbers that the photographs say are wrong.
         found: What each photograph says about its camera, as of the last look.
+        quality: PSNR with which each photograph was met then [dB], ``(V,)``; NaN where it shows nothing.
     """
 
     def __init__(
@@ -279,6 +283,7 @@ class RigFitter(Fitter):
         self.cameras = list(cameras)
         self.kinds: tuple[str, ...] = ()
         self.found: list[Evidence] = []
+        self.quality = np.full(len(views), np.nan)
         self._level, self._progress = level, progress
         self._reduced = [view.camera for view in reduced]
         self._corners = [_corner(view, part) for view, part in zip(reduced, crop_views(reduced), strict=True)]
@@ -308,8 +313,7 @@ class RigFitter(Fitter):
 
     def behind(self) -> NDArray[np.bool_]:
         """Return which photographs are met much worse than the others, ``(V,)``."""
-        psnr = self.psnr()
-        return psnr < np.nanmedian(psnr) - MOST_BEHIND
+        return self.quality < min(float(np.nanmedian(self.quality)) - MOST_BEHIND, ALIKE)
 
     def contradicting(self, views: Sequence[CapturedView]) -> NDArray[np.bool_]:
         """Return which of all views contradict the others, by what they show or where it ends, ``(V,)``."""
@@ -317,7 +321,7 @@ class RigFitter(Fitter):
 
     def is_lost(self) -> bool:
         """Tell whether a camera is too far off, or too little is known, for steps to lead anywhere."""
-        is_poor = float(np.nanmedian(self.psnr())) < POOR
+        is_poor = float(np.nanmedian(self.quality)) < POOR
         return is_poor or self.is_far() or bool(self.behind().any()) or _root_mean_square(self.errors()) > WORST_ERROR
 
     def steps(self) -> list[NDArray[np.float64]]:
@@ -352,6 +356,7 @@ class RigFitter(Fitter):
         """Return what a photograph says about its camera, in numbers of the photograph's own size."""
         group, index = self._targets[view]
         group.draw(index, self.parameters.drawn)
+        self.quality[view] = group.psnr(index)
         drawn, photograph, depth = group.compared(index)
         camera = self._reduced[view].cropped(*self._corners[view], group.width, group.height)
         return evidence(drawn, photograph, depth, camera)
@@ -447,7 +452,7 @@ def judged(names: Sequence[str], given: Sequence[Camera], fitter: RigFitter) -> 
         given: Cameras as the capture states them.
         fitter: The finest level, after its last look.
     """
-    points, psnr = fitter.surface(), fitter.psnr()
+    points, psnr = fitter.surface(), fitter.quality
     is_applied = bool(fitter.kinds)
     kinds = fitter.kinds or MOVED_KINDS[:1]
     if is_applied:

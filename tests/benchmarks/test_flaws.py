@@ -2,13 +2,17 @@
 
 import argparse
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import flaws as benchmark
 import numpy as np
 import pytest
 import tables_flaws
+from support.fake_steps import write_capture
 
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera
 from beam_warp.capture.findings import Finding
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import sh_basis
@@ -73,6 +77,27 @@ def test_colors_in_units_of_white_are_those_of_the_clean_capture(rng):
         for made in (sequence, benchmark.in_units_of(sequence, 1.6))
     )
     np.testing.assert_allclose(after, 1.6 * before, atol=1e-5)
+
+
+def test_poses_are_compared_but_for_a_motion_of_the_world(tmp_path, rng):
+    capture = Capture.read(write_capture(tmp_path / "ball", (0,), cameras=8))
+    surface = rng.uniform(-0.5, 0.5, (400, 3))
+    world = np.eye(4)
+    world[:3, 3] = [2e-3, 0.0, -1e-3]
+    shaken = []
+    for entry in capture.records:
+        pose = world @ entry.camera.camera_to_world
+        shaken.append(replace(entry, camera=replace(entry.camera, camera_to_world=pose)))
+    turned = moved_camera(shaken[0].camera, [0.01, *[0.0] * 8])
+    shaken[0] = replace(shaken[0], camera=turned)
+    copy = Capture(**{**vars(capture), "records": tuple(shaken)})
+    mend = RigCorrection((CameraCorrection("c0", turn=(-0.01, 0.0, 0.0)),), is_applied=True, confidence=9.0)
+    found = benchmark.recovered_poses(capture, copy, mend, surface)
+    assert found["pose_pixels_injected"] > 0.05
+    assert found["pose_pixels"] < 1e-3
+    assert found["pose_mm"] < 1e-2
+    assert found["gauge_mm"] == pytest.approx(1e3 * np.hypot(2e-3, 1e-3), rel=1e-2)
+    assert benchmark.recovered_poses(capture, copy, None, surface)["pose_mm"] == found["pose_mm_injected"]
 
 
 def test_rows_of_other_code_are_not_continued(tmp_path):
