@@ -56,7 +56,7 @@ def test_words_json_and_quiet(sound, capsys):
 
 
 def corrections(**changes):
-    """Of a camera that is turned, one that is left out, and sound ones."""
+    """Corrections of a camera that is turned, one that is left out, and sound ones."""
     cameras = [CameraCorrection(f"c{k:02d}", pixels=0.01, error=0.02, place_error=4e-3) for k in range(CAMERAS)]
     cameras[2] = CameraCorrection("c02", turn=(0.0, 0.01, 0.0), pixels=0.41, error=0.02, place_error=4e-3)
     cameras[5] = CameraCorrection("c05", is_used=False)

@@ -60,7 +60,7 @@ def test_turns_are_found_again(dots):
 
 
 def test_errors_are_those_that_noise_makes(rng, monkeypatch):
-    """Of 20 photographs with noise alone: |z| is 1 in the mean, as far as 60 numbers tell."""
+    """The mean of |z| is 1 where photographs differ by noise alone, as far as 60 numbers tell."""
     monkeypatch.setattr(alignment, "MODEL_ERROR", 1.0)
     camera = CAMERA.supersampled(3)
     drawn = np.stack([5.0 + gaussian_filter(rng.normal(size=(216, 288)), 3.0) for _ in range(4)], axis=-1)
