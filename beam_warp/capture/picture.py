@@ -78,6 +78,8 @@ class Rig:
         left = {}
         for record in report.capture.select(split=SPLIT):
             left.setdefault(record.camera_name, []).append(record.name in report.left_out)
+        bad = set() if corrections is None else {camera.camera for camera in corrections.cameras if not camera.is_used}
+        left |= {name: [True] for name in bad & set(left)}
         kinds = {
             name: "other" if name not in left else "left out" if all(left[name]) else "train" for name in report.cameras
         }
@@ -207,7 +209,8 @@ def write_picture(report: CaptureReport, path: Path, corrections: RigCorrection 
     from matplotlib.figure import Figure
 
     glimpses = shown_glimpses(report)
-    lines = _finding_lines(all_findings(report, corrections))
+    moved = [] if corrections is None else [(corrections.summary().capitalize() + ".", GREY)]
+    lines = [*moved, *_finding_lines(all_findings(report, corrections))]
     aspect = max((g.pixels.shape[0] / g.pixels.shape[1] for g in glimpses), default=1.0)
     columns = -(-len(glimpses) // max(1, -(-len(glimpses) // COLUMNS))) or 1  # rows as even as they can be
     cell = (WIDTH - 0.6) / max(columns, 5)
@@ -225,7 +228,7 @@ def write_picture(report: CaptureReport, path: Path, corrections: RigCorrection 
     figure.text(
         0.3 / WIDTH, 1 - 0.36 / total, report.capture.folder.resolve().name, size=17, weight="bold", va="center"
     )
-    figure.text(0.3 / WIDTH, 1 - 0.64 / total, headline(report, corrections), size=10, color=GREY, va="center")
+    figure.text(0.3 / WIDTH, 1 - 0.64 / total, headline(report), size=10, color=GREY, va="center")
     figure.text(1 - 0.3 / WIDTH, 1 - 0.36 / total, verdict(report), size=12, color=color, ha="right", va="center")
     rig = Rig.of(report, corrections)
     _legend(figure, rig, total)
