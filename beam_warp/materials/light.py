@@ -30,7 +30,7 @@ from beam_warp.materials.light_fits import (
     turned_lights,
     well_shown,
 )
-from beam_warp.materials.light_turn import turned_cells, unexplained_part
+from beam_warp.materials.light_turn import missing_light, turned_cells, weaker_explains
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
@@ -46,11 +46,6 @@ WELL_SEEN = 2.0
 AGREEMENT = 0.9
 UNCUT = 0.1
 """Pixels by blending weights, agreement of normals and largest saturated part of Gaussians that are asked."""
-
-LEAST_UNEXPLAINED = 0.05
-CERTAIN = 3.0
-"""Part of neighbours' differences that another light explains, and its standard errors, from which on the light is that
-of another place: 0.01 with the right light, 0.1 and more with others."""
 
 NEAR = 1
 """Turns, in columns, that count as none: neither lights nor normals are known better than by a cell."""
@@ -201,19 +196,20 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
         exposure_stops=_exposure_stops(mean_colors(shown), irradiance_over_pi(shown, lights[best])),
         point_count=count,
     )
-    is_unlike = all(_is_unlike(shown, fits, way, environment) for way in (here, there))
+    is_unlike = all(_is_unlike(shown, fits, way, lights[way], environment) for way in (here, there))
     ways = [best] if fits.clearly(best, other) > 1.0 else [best, other]
     told = [f"{'mirrored and ' if way >= LIGHT_COLUMNS else ''}turned by {_refined(fits, way):+.0f}" for way in ways]
     return replace(check, findings=tuple(_findings(check, is_unlike, " degrees, or ".join(told))))
 
 
-def _is_unlike(shown: LightEvidence, fits: LightFits, way: int, environment: EnvironmentMap) -> bool:
+def _is_unlike(
+    shown: LightEvidence, fits: LightFits, way: int, cells: NDArray[np.float64], environment: EnvironmentMap
+) -> bool:
     """Return whether a light, at its best turn, leaves shading between neighbours that another light explains."""
-    if fits.clearly(EVEN, way) > 1.0:
+    if fits.clearly(EVEN, way) > 1.0 or weaker_explains(shown, cells) > 1.0:
         return True
     light = EnvironmentMap(environment.radiance[:, ::-1].copy()) if way >= LIGHT_COLUMNS else environment
-    gain, error = unexplained_part(shown, turned_cells(light, np.array([_refined(fits, way)]))[:, 0])
-    return gain > LEAST_UNEXPLAINED and gain > CERTAIN * error
+    return missing_light(shown, turned_cells(light, np.array([_refined(fits, way)]))[:, 0]).is_certain
 
 
 def possible_scales(evidence: LightEvidence, environment: EnvironmentMap) -> tuple[float, float]:

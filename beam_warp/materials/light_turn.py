@@ -18,12 +18,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from beam_warp.materials.light_fits import (
+    CHANCE,
+    LEAST_GAIN,
     LEAST_POINTS,
     LEAST_VIEWS,
     LIGHT_COLUMNS,
     LIGHT_ROWS,
+    NEIGHBORS,
     LightEvidence,
     cell_angles,
     cell_directions,
@@ -62,6 +66,14 @@ are off by up to three."""
 
 LARGEST_TURN = 10.0
 """Turn up to which a light is taken to be mounted askew [degree]; beyond, it follows another convention."""
+
+LEAST_EXPLAINED = 0.02
+LEAST_MISSING = 0.15
+"""Gain and size from which on a smooth missing light means that the stated one is that of another place. The right
+light gains up to 0.01 and its harmonics have a size of up to 0.08; of others, up to 0.14 and 0.6."""
+
+MOST_ALIKE = 0.8
+"""Part of normals that places may tell: all on a ball, half or less on figures."""
 
 ROUNDS = 8
 SMALLEST_DIFFERENCE = 0.02
@@ -144,65 +156,113 @@ def turned_cells(environment: EnvironmentMap, degrees: NDArray[np.float64]) -> N
     return cells.reshape(LIGHT_ROWS * LIGHT_COLUMNS, len(degrees), 3).astype(np.float32)
 
 
-def unexplained_part(shown: LightEvidence, cells: NDArray[np.float32]) -> tuple[float, float]:
-    """Return how much of neighbours' differences a smooth light beside the stated one explains, with standard error.
+@dataclass(frozen=True)
+class MissingLight:
+    """Smooth light beside a stated one that explains differences between neighbours.
+
+    Attributes:
+        gain: Logarithm of neighbours' differences without it over those with it, smooth paint taken out of both.
+        gain_error: Standard error of the same.
+        size: Standard deviation over the points of its logarithm, of irradiance.
+    """
+
+    gain: float
+    gain_error: float
+    size: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the stated light lacks so much, beyond doubt, that it is another one."""
+        return self.size > LEAST_MISSING and self.gain > max(LEAST_EXPLAINED, CERTAIN * self.gain_error)
+
+
+def missing_light(shown: LightEvidence, cells: NDArray[np.float32]) -> MissingLight:
+    """Find the smooth light that explains most of neighbours' differences.
 
     Whatever light is missing or wrong, irradiance changes smoothly with the normal: its ratio to the stated one is
-    fitted by harmonics up to the second degree. Under the right light nothing is left for them to explain. Each part of
-    the surface is explained by what the others give, so that what is fitted to chance explains nothing.
+    fitted by harmonics up to the second degree. Under the right light nothing is left for them to explain. What places
+    explain, up to the second degree, may be paint: on a ball that is all, and nothing is known. Each part of the
+    surface is explained by what the others give, so that what is fitted to chance explains nothing.
 
     Args:
         shown: Well-shown points, at least `LEAST_POINTS`.
         cells: Irradiance that each cell sends [W/m²], ``(L, 3)``.
 
-    Returns:
-        The logarithm of differences without over those with the harmonics, and its jackknife's standard error.
-
     Source: nine harmonics hold all but a few percent of irradiance, Ramamoorthi and Hanrahan 2001.
     """
     parts = parts_of(shown.positions)
-    first, second = neighbor_pairs(shown, TURN_NEIGHBORS)
-    base = shown_colors(shown) - log_irradiance(shown, cells[:, None])[:, 0]
-    smooth = _harmonics(shown.normals.astype(np.float64))
-    differences, terms, groups = base[first] - base[second], smooth[first] - smooth[second], parts[first]
-    after = np.stack([_unexplained(differences[:, k], terms, groups) for k in range(3)], axis=1)
-    before_parts, after_parts = (
-        np.bincount(groups, np.abs(values).sum(axis=1), parts.max() + 1) for values in (differences, after)
-    )
-    left_out = np.log((before_parts.sum() - before_parts) / np.maximum(after_parts.sum() - after_parts, 1e-12))
-    gain = float(np.log(max(before_parts.sum(), 1e-12) / max(after_parts.sum(), 1e-12)))
-    return gain, float(np.sqrt((len(left_out) - 1) * left_out.var()))
+    first, second = neighbor_pairs(shown, NEIGHBORS)
+    base = (shown_colors(shown) - log_irradiance(shown, cells[:, None])[:, 0]).mean(axis=1)
+    places = shown.positions.astype(np.float64) - shown.positions.mean(axis=0)
+    of_places = _harmonics(places / max(float(places.std()), 1e-12), squares=3)
+    of_normals = _harmonics(shown.normals.astype(np.float64))
+    if _alike(of_places, of_normals) > MOST_ALIKE:
+        return MissingLight(0.0, float("inf"), 0.0)
+    differences, groups = base[first] - base[second], parts[first]
+
+    def fitted(smooth: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        terms = smooth[first] - smooth[second]
+        whole, others = _fitted(differences, terms, groups)
+        return whole, np.bincount(groups, np.abs(differences - (terms * others[groups]).sum(axis=1)), parts.max() + 1)
+
+    before = fitted(of_places)[1]
+    whole, after = fitted(np.hstack([of_places, of_normals]))
+    left_out = np.log((before.sum() - before) / np.maximum(after.sum() - after, 1e-12))
+    error = float(np.sqrt((len(left_out) - 1) * left_out.var()))
+    size = float((of_normals @ whole[of_places.shape[1] :]).std())
+    return MissingLight(float(np.log(before.sum() / max(after.sum(), 1e-12))), error, size)
 
 
-def _harmonics(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return harmonics of the first and second degree, up to factors, ``(M, 8)``."""
-    x, y, z = normals.T
-    return np.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3.0 * z * z - 1.0], axis=1)
+def _harmonics(vectors: NDArray[np.float64], *, squares: int = 2) -> NDArray[np.float64]:
+    """Return polynomials of the first and second degree, ``(M, 6 + squares)``; of unit vectors, two squares are all."""
+    x, y, z = vectors.T
+    return np.stack([x, y, z, x * y, y * z, z * x, x * x, y * y, z * z][: 6 + squares], axis=1)
 
 
-def _unexplained(
+def _alike(places: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    """Return which part of the variance of the one, ``(M, K)``, the other explains."""
+    terms = np.hstack([np.ones((len(places), 1)), places])
+    left = normals - terms @ np.linalg.lstsq(terms, normals)[0]
+    return 1.0 - float(left.var(axis=0).sum() / max(float(normals.var(axis=0).sum()), 1e-12))
+
+
+def _fitted(
     differences: NDArray[np.float64], terms: NDArray[np.float64], groups: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return what least absolute errors leave of differences ``(P,)``, each group fitted by all others."""
-    weights = np.ones(len(differences))
-    squares, products = np.zeros((0, 0, 0)), np.zeros((0, 0))
-    for _ in range(ROUNDS):
-        squares, products = _normal_equations(terms, differences, weights, groups)
-        found = np.linalg.solve(squares.sum(axis=0), products.sum(axis=0))
-        weights = 1.0 / np.maximum(np.abs(differences - terms @ found), SMALLEST_DIFFERENCE)
-    others = np.linalg.solve(squares.sum(axis=0) - squares, (products.sum(axis=0) - products)[..., None])[..., 0]
-    return differences - np.einsum("pk,pk->p", terms, others[groups])
-
-
-def _normal_equations(
-    terms: NDArray[np.float64], values: NDArray[np.float64], weights: NDArray[np.float64], groups: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return each group's weighted normal equations, ``(B, K, K)`` and ``(B, K)``, a little pulled towards none."""
-    count, size = int(groups.max()) + 1, terms.shape[1]
+    """Fit differences ``(P,)`` in least absolute errors: factors of all, ``(K,)``, and of all but each group."""
+    pull, whole = PULL * np.square(terms).sum(axis=0).mean() * np.eye(terms.shape[1]), np.zeros(terms.shape[1])
+    weights = np.ones(len(differences))
+    for _ in range(ROUNDS):
+        weighted = terms * weights[:, None]
+        whole = np.linalg.solve(weighted.T @ terms + weights.mean() * pull, weighted.T @ differences)
+        weights = 1.0 / np.maximum(np.abs(differences - terms @ whole), SMALLEST_DIFFERENCE)
     weighted = terms * weights[:, None]
-    squares = np.stack([weighted[groups == group].T @ terms[groups == group] for group in range(count)])
-    products = np.stack([weighted[groups == group].T @ values[groups == group] for group in range(count)])
-    return squares + PULL * np.eye(size) * squares.trace(axis1=1, axis2=2)[:, None, None] / size, products
+    rows = [np.flatnonzero(groups == group) for group in range(int(groups.max()) + 1)]
+    squares = np.stack([weighted[some].T @ terms[some] for some in rows])
+    products = np.stack([weighted[some].T @ differences[some] for some in rows])[..., None]
+    left = squares.sum(axis=0) - squares + weights.mean() * pull
+    return whole, np.linalg.solve(left, products.sum(axis=0) - products)[..., 0]
+
+
+def weaker_explains(shown: LightEvidence, light: NDArray[np.float64]) -> float:
+    """Return how clearly a light of half the contrast explains what is shown better: above 1 is a verdict.
+
+    Shading of the right light, raised to a power, leaves neighbours' base colours most alike at a power of 1. Another
+    light is right about some of the shading at best, so that less of it explains more.
+
+    Args:
+        shown: Well-shown points, at least `LEAST_POINTS`.
+        light: Radiance of the cells, ``(L, 3)``.
+    """
+    colors = shown_colors(shown)
+    irradiance = log_irradiance(shown, (light * cell_angles()[:, None])[:, None].astype(np.float32))[:, 0]
+    base = np.concatenate([colors - irradiance, colors - 0.5 * irradiance], axis=1)
+    apart, _ = neighbor_differences(shown, base, parts_of(shown.positions), TURN_NEIGHBORS)
+    full, half = apart.reshape(len(apart), 2, 3).sum(axis=2).T
+    left_out = np.log(np.maximum(full.sum() - full, 1e-6) / np.maximum(half.sum() - half, 1e-6))
+    chance = student.ppf(1.0 - CHANCE, len(full) - 1) * float(np.sqrt((len(full) - 1) * left_out.var()))
+    gain = float(np.log(max(full.sum(), 1e-6) / max(half.sum(), 1e-6)))
+    return gain / max(float(chance), LEAST_GAIN)
 
 
 def shown_colors(shown: LightEvidence) -> NDArray[np.float64]:
