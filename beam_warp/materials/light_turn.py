@@ -6,8 +6,10 @@ from leaving out one part of the surface after the other. What hides the sky sen
 the turn of a walking figure is off by two to four degrees, because the sides of its limbs that face each other are
 brighter than the sky alone makes them.
 
-Changes from view to view tell the turn of the same figures three times less well than shading does, and are left out;
-tilts about level axes are as uncertain, and are not looked for.
+Changes from view to view tell the turn of the same figures less well than shading does, because their places depend on
+the roughness that is assumed, and are left out; tilts about level axes are as uncertain, and are not looked for.
+
+A light that no turn mends is that of another place. What such a light lacks changes smoothly with the normal.
 
 Source: see `beam_warp.materials.light_fits`; the jackknife, Efron and Stein 1981.
 """
