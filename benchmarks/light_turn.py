@@ -6,22 +6,19 @@ Of each capture, Gaussians on the true surface of its first frame are asked, so 
 `beam_warp.materials.light_turn` leaves out; two disjoint halves of them are two subsets. The light is stated turned by
 each of `TURNS`. *Scale* is how bright highlights change from view to view over what the stated light predicts, F0 =
 0.04, in least squares over points and views: 1 where the roughness is right and normals are exact. Tilts about level
-axes are not looked for. *With true paint*: colours are divided by true base colours, where test views show them, so
-that only shading is left: what is then off is not the paint's fault. *Other places*: lights of other captures, and
-those that captures are relit with, brought to the same mean, in turn; what is said of each.
+axes are not looked for. *Other places*: lights of other captures, and those that captures are relit with, brought to
+the same mean, in turn; what is said of each.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import record
-from numpy.typing import NDArray
 
 from beam_warp.capture.capture import Capture
 from beam_warp.device.arrays import resolve_device
@@ -41,9 +38,6 @@ TURNS = (0.0, 2.0, -2.0, 4.0, -4.0, 8.0, -8.0)
 ROUGHNESSES = (0.3, 0.5, 0.7)
 GAUSSIANS = 30_000
 ASKED = 4096
-SOLID, SAME_PLACE, SAME_SIDE, DARKEST = 0.999, 0.01, 0.8, 0.02
-"""Coverage, distance [m], cosine of normals and base colour of points whose paint is taken from truth images."""
-
 SAME_LIGHT = 0.1
 """Mean difference of two lights of mean 1 below which they are the same."""
 
@@ -60,7 +54,7 @@ def evidence_of(capture: Capture, device: str) -> LightEvidence:
     return light_evidence(scene, SurfacePoints.seen_by(cloud, seen, scene), seen, ASKED)
 
 
-def some(evidence: LightEvidence, rows: slice | NDArray[np.int64]) -> LightEvidence:
+def some(evidence: LightEvidence, rows: slice) -> LightEvidence:
     """Return some of the points."""
     return LightEvidence(
         positions=evidence.positions[rows],
@@ -70,12 +64,6 @@ def some(evidence: LightEvidence, rows: slice | NDArray[np.int64]) -> LightEvide
         weights=evidence.weights[:, rows],
         directions=evidence.directions[:, rows],
     )
-
-
-def turn_of(evidence: LightEvidence, light: EnvironmentMap) -> dict[str, float]:
-    """Return what is found of the light as it is."""
-    turn = find_turn(evidence, light)
-    return {"error": turn.degrees, "standard_error": turn.standard_error}
 
 
 def turns(evidence: LightEvidence, light: EnvironmentMap) -> list[dict[str, Any]]:
@@ -88,28 +76,6 @@ def turns(evidence: LightEvidence, light: EnvironmentMap) -> list[dict[str, Any]
             said = {"error": turn.degrees + stated, "standard_error": turn.standard_error}
             found.append({"half": half, "stated": stated, **said, "applied": turn.is_certain})
     return found
-
-
-def without_paint(evidence: LightEvidence, capture: Capture) -> LightEvidence:
-    """Return the points that test views show, with colours divided by true base colours."""
-    frame, points = capture.frames[0], evidence.positions.astype(np.float64)
-    paint, weight = np.zeros((len(points), 3)), np.zeros((len(points), 1))
-    for entry in capture.select(split="test", frames={frame}):
-        if entry.truth_path is None:
-            continue
-        truth, camera = entry.truth().channels, entry.view().camera
-        across, down, depth = camera.project(points).T
-        column = np.clip(across.astype(np.int64), 0, camera.width - 1)
-        row = np.clip(down.astype(np.int64), 0, camera.height - 1)
-        normals = np.stack([truth[f"normal.{axis}"][row, column] for axis in "XYZ"], axis=1)
-        sees = (truth["A"][row, column] > SOLID) & (np.abs(truth["depth"][row, column] - depth) < SAME_PLACE)
-        sees &= (across >= 0.0) & (down >= 0.0) & (across < camera.width) & (down < camera.height)
-        sees &= (normals * evidence.normals).sum(axis=1) > SAME_SIDE
-        paint[sees] += np.stack([truth[f"base_color.{name}"][row, column] for name in "RGB"], axis=1)[sees]
-        weight[sees] += 1.0
-    known = np.flatnonzero((weight[:, 0] > 0.0) & (paint.min(axis=1) > DARKEST * weight[:, 0]))
-    shown = some(evidence, known)
-    return replace(shown, colors=(shown.colors / (paint / np.maximum(weight, 1.0))[known]).astype(np.float32))
 
 
 def places(data: Path) -> dict[str, EnvironmentMap]:
@@ -177,7 +143,6 @@ def main() -> None:
             "turns": turns(evidence, light),
             "highlights": highlight_scales(evidence, light),
             "possible_scales": possible_scales(evidence, light),
-            "with_true_paint": turn_of(without_paint(evidence, capture), light),
             "places": of_other_places(some(evidence, slice(0, None, 2)), light, others),
         }
         print(name, rows[name], flush=True)

@@ -207,7 +207,7 @@ def light_turn(result: Row) -> Rows:
     for name, found in result["captures"].items():
         turns, highlights = found["turns"], found["highlights"]
         rows = rows or [
-            ["", "light as measured", "with true paint", "worst of all stated turns", "turned, as measured"]
+            ["", "light as measured", "worst of all stated turns", "turned, as measured"]
             + ["turned by 8°", "other places told"]
             + [f"scale at roughness {roughness}" for roughness in highlights]
         ]
@@ -223,7 +223,6 @@ def light_turn(result: Row) -> Rows:
             [
                 name,
                 ", ".join(f"{turn['error']:+.1f}° ± {turn['standard_error']:.1f}°" for turn in right),
-                f"{found['with_true_paint']['error']:+.1f}°",
                 f"{max((turn['error'] for turn in turns), key=abs):+.1f}°",
                 applied(0.0, 0.0),
                 applied(8.0, 8.0),

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 from support.lit_balls import LIGHTS, Ball
 
+from beam_warp.decomposition.capture_light import CaptureLight
 from beam_warp.materials import light_turn
 from beam_warp.materials.light import judge_light, possible_scales
 from beam_warp.materials.light_fits import (
@@ -207,3 +208,14 @@ def test_physics_alone_bounds_the_scale():
     np.testing.assert_allclose(doubled, (2.0 * least, 2.0 * most), rtol=1e-5)
     few = Ball.of(LEAST_POINTS // 2).evidence(LIGHTS["studio"])
     assert np.isnan(possible_scales(few, LIGHTS["studio"])).all()
+
+
+def test_how_far_base_colors_are_known_is_said():
+    """A note with both bounds, beside the warning about a turn; nothing where nothing was asked."""
+    light = LIGHTS["studio"]
+    known = CaptureLight(light, None, 0.0, False, LightTurn(6.0, 1.0), 0.0, (0.2, 0.9))
+    turned, scale = known.findings
+    assert (turned.code, turned.severity) == ("environment-turned", "warning")
+    assert (scale.code, scale.severity) == ("base-color-scale", "note")
+    assert "0.2 to 0.9 times as bright" in str(scale)
+    assert replace(known, turn=LightTurn(), scales=(float("nan"), float("nan"))).findings == []
