@@ -289,7 +289,7 @@ def mirrored(shown: LightEvidence, lights: NDArray[np.float64], roughness: float
     return result
 
 
-def dielectric_fresnel(cosine: NDArray[np.float32]) -> NDArray[np.float32]:
+def dielectric_fresnel(cosine: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the part of unpolarised light that a surface of index 1.5 reflects, by the cosine of incidence."""
     inner = np.sqrt(cosine * cosine + np.float32(1.25))
     across = (inner - cosine) / (inner + cosine)

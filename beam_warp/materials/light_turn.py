@@ -205,7 +205,8 @@ def missing_light(shown: LightEvidence, cells: NDArray[np.float32]) -> MissingLi
     def fitted(smooth: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         terms = smooth[first] - smooth[second]
         whole, others = _fitted(differences, terms, groups)
-        return whole, np.bincount(groups, np.abs(differences - (terms * others[groups]).sum(axis=1)), parts.max() + 1)
+        left = np.abs(differences - (terms * others[groups]).sum(axis=1))
+        return whole, np.bincount(groups, left, parts.max() + 1).astype(np.float64)
 
     before = fitted(of_places)[1]
     whole, after = fitted(np.hstack([of_places, of_normals]))
