@@ -353,6 +353,9 @@ MATERIALS = (
             ("LEAST_TURN", "Least turn that is undone [degree]."),
             ("LARGEST_TURN", "Largest turn that is undone [degree]."),
             ("CERTAIN", "Standard errors from which on a turn is undone."),
+            ("LEAST_EXPLAINED", "Differences that other light explains, from which on a light is another place's."),
+            ("LEAST_MISSING", "Size of that other light."),
+            ("MOST_ALIKE", "Part of normals that places may tell."),
         )
     ),
     *(
@@ -485,8 +488,8 @@ UNTUNED = {
         beam_warp.materials.images: UNLIT_PART WHOLE_ALPHA CROP_MARGIN UNSEEN_EVIDENCE
         beam_warp.materials.light: ASKED MOST_VIEWS NEAR
         beam_warp.materials.light_fits: LIGHT_ROWS LIGHT_COLUMNS EVEN LEAST_LIGHT BLOCKS LEAST_IN_BLOCK LEAST_POINTS
-        beam_warp.materials.light_fits: LEAST_VIEWS
-        beam_warp.materials.light_turn: SPLIT LEAST_COLOR LEAST_LIGHT FLAT
+        beam_warp.materials.light_fits: LEAST_VIEWS VIEW_THREADS
+        beam_warp.materials.light_turn: SPLIT LEAST_COLOR LEAST_LIGHT FLAT ROUNDS SMALLEST_DIFFERENCE PULL
         beam_warp.materials.residues: LEAST_ALPHA FEWEST_LIGHT_SAMPLES
         beam_warp.materials.roughness: MOST_ASKED TINY
         beam_warp.materials.roughness_source: MAX_TEXELS

@@ -60,7 +60,23 @@ class CaptureLight:
 
     @property
     def findings(self) -> list[Finding]:
-        """What is to be said about a light that is askew."""
+        """What is to be said about a light that is askew, and about its scale."""
+        return self._askew() + self._scale()
+
+    def _scale(self) -> list[Finding]:
+        """Return a note on how far base colours are known; none where nothing was asked."""
+        if not np.isfinite(self.scales).all():
+            return []
+        least, most = self.scales
+        what = (
+            "the scale of the light is as stated, and nothing in the images checks it closely: under a brighter or "
+            f"dimmer one, base colours would be {least:.2g} to {most:.2g} times as bright"
+        )
+        remedy = "Base colours are as sure as the light's exposure: a grey card in the images would check it."
+        return [Finding("note", "base-color-scale", what, remedy=remedy)]
+
+    def _askew(self) -> list[Finding]:
+        """Return a warning about a light that is turned."""
         if not self.turn.is_certain:
             return []
         done, remedy = "it was turned by that", "Keep it as it is by --no-turn-light, if it was measured better."
@@ -113,6 +129,7 @@ def prepare_light(environment: EnvironmentMap, source: Source, described: str, f
         stops = float(found["stops"][0])
         is_fitted = bool(stops) or not source.has_light
     scaled = environment.scaled(2.0**stops)
+    scales = (scales[0] * 2.0**stops, scales[1] * 2.0**stops)
     return CaptureLight(scaled, given.scaled(2.0**stops), stops, is_fitted, turn, turned_by, scales)
 
 
