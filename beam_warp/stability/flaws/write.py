@@ -3,7 +3,8 @@
 The copy holds what a studio delivers: images of the training cameras, masks, calibration, and the light as measured.
 Where coverage is right, images hold the subject alone, keyed out: straight colour and coverage. Where it is not, they
 are photographs of the subject before a grey wall, without coverage, and masks lie beside them: a mask that is too large
-shows some of the wall, and nothing in the copy tells where the subject ends but the pictures themselves.
+shows some of the wall, and nothing in the copy tells where the subject ends but the pictures themselves. Cut-outs alone
+have straight colour over nothing, and wrong coverage.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ FLAWS: Mapping[str, str] = {
     "noise": "photon noise of 2 % at white, read noise of 0.2 %, 8-bit sRGB PNG",
     "plate": "photographs before a grey wall, with exact masks",
     "masks": "masks one pixel too large in half of the cameras, too small in the others, before a grey wall",
+    "cutouts": "cut-outs, colour over nothing, one pixel too large in half of the cameras, too small in the others",
     "poses": "poses off by 0.3 pixel of rotation and 1 mm",
     "light": "environment turned by 2° and 10 % too bright",
     "motion-blur": "the subject moves by a pixel while the shutter is open",
@@ -203,6 +205,10 @@ class _Shot:
         flaws = self.cameras[record.camera_name]
         layers = self._seen(record, flaws)
         alpha = layers[..., 3]
+        if "cutouts" in self.flaws and not self.is_photograph:
+            coverage = offset_coverage(alpha, flaws.mask_pixels)
+            layers = np.dstack([straight(layers) * coverage[..., None], coverage])
+            alpha = coverage
         color = layers[..., :3] if not self.is_encoded else straight(layers)
         if self.is_photograph:
             wall = plate(alpha.shape, self.wall, stream(self.seed, "plate", record.camera_name))
