@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
 from beam_warp.capture.mattes import SOLID, moved_mask
@@ -45,7 +46,7 @@ LEAST_COVERAGE = 0.05
 """Coverage below which a straight colour means nothing."""
 
 SOLID_COLOR = 0.99
-"""Colour is the subject's alone where coverage is more, before and after its outline is moved."""
+"""Where coverage is more, before and after an outline is moved, the subject's own light is sought."""
 
 
 @dataclass(frozen=True)
@@ -93,15 +94,26 @@ def ring_of(view: CapturedView) -> Ring:
 def taken_in(view: CapturedView, pixels: float) -> CapturedView:
     """Take a view's mask in by so many pixels, or let it out if negative; 0 returns the view.
 
-    Colour along the outline, which the file does not have or has with too little light, is that of the nearest pixels
-    that are the subject's alone.
+    Colour that fades within a mask that is too large is multiplied by the true coverage already, and stays. Elsewhere
+    straight colour is the subject's in each pixel that has light, and beyond those that of the nearest one.
     """
     if view.alpha is None or pixels == 0.0:
         return view
     alpha = moved_mask(view.alpha, float(np.clip(pixels, -MOST_PIXELS, MOST_PIXELS)))
-    solid = np.minimum(alpha, view.alpha) > SOLID_COLOR
-    if not solid.any():
+    straight = view.color / np.maximum(view.alpha, LEAST_COVERAGE)[..., None]
+    within = np.minimum(alpha, view.alpha)
+    if not (within > SOLID_COLOR).any():
         return replace(view, alpha=alpha, color=np.minimum(view.color, alpha[..., None]))
-    nearest: Any = distance_transform_edt(~solid, return_distances=False, return_indices=True)
-    color = view.color[tuple(nearest)] * np.where(solid, 1.0, alpha)[..., None]
-    return replace(view, alpha=alpha, color=color.astype(np.float32))
+    if pixels > 0.0:
+        inner = _spread(straight, within > SOLID_COLOR).sum(axis=-1)
+        alpha[straight.sum(axis=-1) < DARK * inner] = 0.0
+        if ring_of(view).dim > FADES:
+            return replace(view, alpha=alpha)
+    lit = (within > 2.0 * LEAST_COVERAGE) & (alpha > 0.0)
+    return replace(view, alpha=alpha, color=(_spread(straight, lit) * alpha[..., None]).astype(np.float32))
+
+
+def _spread(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return an image with pixels that are not known as the nearest known ones; some must be."""
+    nearest: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return image[tuple(nearest)]
