@@ -191,12 +191,13 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
         )
     full = [glimpse for glimpse, alpha in known if float(alpha.min()) > 0.99]
     if full:
-        findings.warn(
+        findings.add(
+            "error" if len(full) == len(glimpses) else "warning",
             "full-mask",
             f"mask or alpha of {count_of(len(full), 'image')} of {len(known)} is white everywhere: background "
             "counts as the subject does",
             _names(full),
-            "Make the masks again, or drop alpha.",
+            "Make masks that are white on the subject alone, or save the images without alpha.",
         )
     inverted = [glimpse for glimpse, alpha in known if glimpse not in full and _is_inverted(alpha)]
     if inverted:
