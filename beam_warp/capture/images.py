@@ -168,7 +168,7 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
             "no-coverage",
             "images have no alpha and no masks: background counts as the subject does, and there is no visual hull",
             remedy="For a subject by itself, write masks (masks/<image>.png, white on the subject) or plates "
-            "(plates/<camera>.png, without the subject).",
+            "(plates/<camera>.png, without the subject; beam plates makes them where the subject moves).",
         )
         return
     unknown = [glimpse for glimpse in glimpses if glimpse.alpha is None]
