@@ -77,7 +77,7 @@ def ring_of(view: CapturedView) -> Ring:
     alpha = view.alpha[box]
     solid = alpha > SOLID
     light = view.color[box].sum(axis=-1) / np.maximum(alpha, LEAST_COVERAGE)
-    deep = solid
+    deep: Any = solid  # scipy's types say less
     for shape in (None, SQUARE, None):
         deep = binary_erosion(deep, shape, border_value=1)
     weight = gaussian_filter(deep.astype(np.float32), SPREAD)
@@ -113,7 +113,7 @@ def taken_in(view: CapturedView, pixels: float) -> CapturedView:
     return replace(view, alpha=alpha, color=(_spread(straight, lit) * alpha[..., None]).astype(np.float32))
 
 
-def _spread(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _spread(image: NDArray[np.floating], known: NDArray[np.bool_]) -> NDArray[np.floating]:
     """Return an image with pixels that are not known as the nearest known ones; some must be."""
     nearest: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return image[tuple(nearest)]

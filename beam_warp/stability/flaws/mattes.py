@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, shift
@@ -48,7 +50,8 @@ def blotted_coverage(
         generator: Draws where: the hole somewhere within, the blob where the subject is as near as it is wide.
     """
     rows, columns = np.indices(alpha.shape)
-    near = (alpha == 0.0) & (distance_transform_edt(alpha == 0.0) < 2.0 * diameter)
+    away: Any = distance_transform_edt(alpha == 0.0)  # its types say that it may be None
+    near = (alpha == 0.0) & (away < 2.0 * diameter)
     blotted = alpha.copy()
     for places, value in ((alpha == 1.0, 0.0), (near, 1.0)):
         found = np.argwhere(places)
