@@ -77,15 +77,15 @@ def ring_of(view: CapturedView) -> Ring:
     alpha = view.alpha[box]
     solid = alpha > SOLID
     light = view.color[box].sum(axis=-1) / np.maximum(alpha, LEAST_COVERAGE)
-    deep: Any = solid  # scipy's types say less
+    deep = solid
     for shape in (None, SQUARE, None):
-        deep = binary_erosion(deep, shape, border_value=1)
+        deep = np.asarray(binary_erosion(deep, shape, border_value=1), dtype=bool)
     weight = gaussian_filter(deep.astype(np.float32), SPREAD)
     inner = gaussian_filter(np.where(deep, light, 0.0).astype(np.float32), SPREAD) / np.maximum(weight, KNOWN)
     band = solid & ~deep & (weight > KNOWN)
     ring = band & (light < DARK * inner)
-    beside = binary_dilation(ring) & band & ~ring
-    edge = band & ~binary_erosion(solid, border_value=1)
+    core, around = np.asarray(binary_erosion(solid, border_value=1), bool), np.asarray(binary_dilation(ring), bool)
+    beside, edge = around & band & ~ring, band & ~core
     if not (beside.any() and binary_dilation(ring, SQUARE, NEAR)[edge].mean() > MOST):
         return Ring()
     return Ring(BAND * float(ring.sum() / band.sum()), float((light < DIM * inner)[beside].mean()))
