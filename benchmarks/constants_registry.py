@@ -20,6 +20,7 @@ JUDGED = "by judgement"
 NO_IMAGES = "the captures have images; it counts only for Gaussians without"
 IMAGE_PATH = "only the image path uses it, the paper's recipe, which is not run here"
 LAMPS = "only lamps use it; relit views have none"
+EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 NO_SCORE = "it decides what is reported, and moves no score"
 BINARY = "a list of powers of two"
@@ -345,6 +346,21 @@ MATERIALS = (
         )
     ),
     *(
+        Constant(f"beam_warp.reconstruction.masks:{name}", "walker, runner, robot", does, EXACT_MASKS)
+        for name, does in (
+            ("LEAST_RING", "Width from which a ring without light is no darkness of the subject [pixel]."),
+            ("FADING", "Distance from the outline to a ring that colour fades to [pixel]."),
+            ("SHARP", "Distance from the outline to a ring where colour ends at once [pixel]."),
+            ("RING_ERROR", "Standard error of an offset that is read from a ring [pixel]."),
+            ("LEAST_MOVE", "Offset from which a mask without a ring is moved [pixel]."),
+            ("MOST_GAUSSIANS", "Gaussians of a fit that shows offsets."),
+            ("VISITS", "How often it looks at each view."),
+            ("ROUNDS", "Most fits."),
+            ("GAIN", "Offsets over what a fit shows of them."),
+            ("SETTLED", "Motion of the masks at which fits end [pixel]."),
+        )
+    ),
+    *(
         Constant(f"beam_warp.materials.light_turn:{name}", "walker, runner, robot", does, NO_SCORE)
         for name, does in (
             ("TURN_NEIGHBORS", "Neighbours whose base colours are compared."),
@@ -439,6 +455,7 @@ UNTUNED = {
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
         beam_warp.materials.light_turn: TURNS
+        beam_warp.reconstruction.masks: FEWEST_VIEWS SIDE SAMPLES WINDOW
         beam_warp.reconstruction.rig: MOST_LEFT_OUT
         beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS

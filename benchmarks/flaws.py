@@ -65,6 +65,7 @@ LEAST_PIXELS = 0.1
 NAMED: Mapping[str, Collection[str]] = {
     "exposure": ("camera-exposure",),
     "masks": ("mask-offset",),
+    "cutouts": ("mask-offset",),
     "light": ("environment-turned", "environment-exposure"),
     "clipping": ("clipped-images",),
     "poses": ("camera-poses",),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture.findings import Findings, are, count_of, names_of
+from beam_warp.capture.findings import Finding, Findings, are, count_of, names_of
 from beam_warp.capture.mattes import MaskOffset
 from beam_warp.capture.records import CaptureRecord
 from beam_warp.image.color import LUMINANCE
@@ -168,7 +168,7 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
             "no-coverage",
             "images have no alpha and no masks: background counts as the subject does, and there is no visual hull",
             remedy="For a subject by itself, write masks (masks/<image>.png, white on the subject) or plates "
-            "(plates/<camera>.png, without the subject).",
+            "(plates/<camera>.png, without the subject; beam plates makes them where the subject moves).",
         )
         return
     unknown = [glimpse for glimpse in glimpses if glimpse.alpha is None]
@@ -191,12 +191,13 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
         )
     full = [glimpse for glimpse, alpha in known if float(alpha.min()) > 0.99]
     if full:
-        findings.warn(
+        findings.add(
+            "error" if len(full) == len(glimpses) else "warning",
             "full-mask",
             f"mask or alpha of {count_of(len(full), 'image')} of {len(known)} is white everywhere: background "
             "counts as the subject does",
             _names(full),
-            "Make the masks again, or drop alpha.",
+            "Make masks that are white on the subject alone, or save the images without alpha.",
         )
     inverted = [glimpse for glimpse, alpha in known if glimpse not in full and _is_inverted(alpha)]
     if inverted:
@@ -221,13 +222,19 @@ def _judge_outlines(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     }
     wrong = {name: found for name, found in off.items() if abs(found[0]) > max(MASK_PIXELS, MASK_ERRORS * found[1])}
     if wrong:
-        findings.warn(
-            "mask-offset",
-            f"masks of {count_of(len(wrong), 'camera')} end more than {MASK_PIXELS:g} pixel outside (+) or inside (-) "
-            "of where the subject does, and are moved there",
-            (f"{name} {pixels:+.1f} ± {error:.1f}" for name, (pixels, error) in wrong.items()),
-            "Make them again for outlines that are exact.",
-        )
+        findings.append(offset_finding({name: MaskOffset(*found) for name, found in wrong.items()}))
+
+
+def offset_finding(offsets: Mapping[str, MaskOffset]) -> Finding:
+    """Return the finding that masks of some cameras end elsewhere than the subject does."""
+    return Finding(
+        "warning",
+        "mask-offset",
+        f"masks of {count_of(len(offsets), 'camera')} end outside (+) or inside (-) of where the subject does, and are "
+        "moved there",
+        names_of(f"{name} {found.pixels:+.1f} ± {found.error:.1f}" for name, found in offsets.items()),
+        "Make them again for outlines that are exact.",
+    )
 
 
 def _is_inverted(alpha: NDArray[np.float32]) -> bool:

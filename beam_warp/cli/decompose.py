@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.corrections import read_corrections
+from beam_warp.capture.mask_corrections import read_mask_corrections
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 from beam_warp.cli.common.pages import SECOND_PAGE
@@ -132,8 +133,9 @@ def decompose(args: Decompose) -> int:
 
 
 def _seen_by(capture: Capture, sequence: Path) -> Capture:
-    """Return a capture with the cameras that a sequence was fitted with, if it lies in a reconstruction's folder."""
-    rig = read_corrections(sequence.parent)
+    """Return a capture with the cameras and masks that a sequence in a reconstruction's folder was fitted with."""
+    masks, rig = read_mask_corrections(sequence.parent), read_corrections(sequence.parent)
+    capture = capture if masks is None else masks.capture(capture)
     return capture if rig is None else rig.capture(capture)
 
 

@@ -41,6 +41,11 @@ class Modelling:
         arg(help="Correct cameras that are beyond doubt wrong, or keep all as the capture states them."),
         SECOND_PAGE,
     ] = "refine"
+    masks: Annotated[
+        Literal["refine", "keep"],
+        arg(help="Move masks of cut-outs that are beyond doubt wrong, or keep all as they are."),
+        SECOND_PAGE,
+    ] = "refine"
     frames: Annotated[
         str | None, arg(metavar="A:B", help="Frames A to B - 1 of the capture; A:B:S takes every S-th of them.")
     ] = None
@@ -135,7 +140,9 @@ def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
     from beam_warp.reconstruction.job import ReconstructOptions
 
     frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
-    return ReconstructOptions(segment_length=modelling.segment_length, frames=frames, cameras=modelling.cameras)
+    return ReconstructOptions(
+        segment_length=modelling.segment_length, frames=frames, cameras=modelling.cameras, masks=modelling.masks
+    )
 
 
 def frames_of(words: str, there: tuple[int, ...]) -> tuple[int, ...]:

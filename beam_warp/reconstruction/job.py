@@ -6,6 +6,7 @@ other: several processes may work on them, and what tracking loses, the next key
 tracking is lost becomes a key frame itself.
 
     plan            frames.plan     the records of each frame, and the segments
+    masks           steps.mend_masks   how far cut-outs are off, from the first frame; corrected records
     cameras         steps.refine_rig   what is wrong with the rig, from its first frame; corrected records
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
@@ -22,9 +23,10 @@ bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,9 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp import converters
+from beam_warp.capture import mask_corrections
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
+from beam_warp.capture.cutouts import taken_in
 from beam_warp.capture.findings import Finding
+from beam_warp.capture.mask_corrections import MaskCorrections, read_mask_corrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
@@ -60,23 +65,27 @@ ASSET_NAME = "gaussians.usda"
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
-    """Options of a reconstruction: its frames, and where key frames are planned.
+    """Options of a reconstruction: its frames, where key frames are planned, and what of the capture is mended.
 
     Attributes:
         segment_length: Frames from one key frame to the next; 0 for a key frame at the start only.
         frames: Numbers of the frames, ascending; None for all of the split.
         cameras: ``"refine"`` corrects cameras that are beyond doubt wrong, the same in all frames; ``"keep"`` takes all
             as the capture states them.
+        masks: ``"refine"`` moves masks of cut-outs that are beyond doubt wrong, those of a camera the same in all
+            frames; ``"keep"`` takes all as they are.
     """
 
     segment_length: int = 0
     frames: tuple[int, ...] | None = None
     cameras: Literal["refine", "keep"] = "refine"
+    masks: Literal["refine", "keep"] = "refine"
 
     def __post_init__(self) -> None:
         """Check every field once."""
         require_count("segment_length", self.segment_length, low=0)
-        require_choice("cameras", self.cameras, ("refine", "keep"))
+        for name in ("cameras", "masks"):
+            require_choice(name, getattr(self, name), ("refine", "keep"))
         if self.frames is not None and list(self.frames) != sorted(set(self.frames)):
             raise InvalidOptionError(
                 f"frames must be ascending and each there once, got {str(self.frames)[:60]}. Sort them."
@@ -114,7 +123,7 @@ class Reconstruction:
         asset: Root layer of the asset.
         sequence: The Gaussians, read lazily from the store; axes "rfu", scene-linear radiance.
         report: What was measured, JSON-able; also written to ``report.json``.
-        capture: The capture with the cameras that the Gaussians were fitted with.
+        capture: The capture with the cameras and masks that the Gaussians were fitted with.
     """
 
     asset: Path
@@ -160,7 +169,8 @@ def reconstruct(
     progress("write asset", 1, 1)
     report = {**_report(job, capture, chosen, resumed), "seconds": time.perf_counter() - started}
     write_report(folder, report)
-    return Reconstruction(asset, sequence, report, capture if job.rig is None else job.rig.capture(capture))
+    seen = job.masks.capture(capture)
+    return Reconstruction(asset, sequence, report, seen if job.rig is None else job.rig.capture(seen))
 
 
 def reconstruct_part(
@@ -213,6 +223,7 @@ class _Job:
     store: FrameStore
     common_inputs: str
     progress: NotedProgress
+    masks: MaskCorrections = field(default_factory=MaskCorrections)
     rig: RigCorrection | None = None
 
 
@@ -225,16 +236,46 @@ def _prepare(
         require_writable(out / name, is_made=True)
     plan = plan_frames(capture, options.frames, options.segment_length)
     job = _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
-    rig = _refined_rig(job, out) if options.cameras == "refine" else None
+    with FrameReader(plan.records, job.store.digests) as reader:
+        read = cache(lambda: reader.views(next(iter(plan.records))))
+        masks = _mended_masks(job, out, reader, read) if options.masks == "refine" else None
+        if masks is None:
+            (out / mask_corrections.FILE_NAME).unlink(missing_ok=True)
+        else:
+            job = replace(job, masks=masks, plan=_corrected(job.plan, masks))
+        rig = _refined_rig(job, out, read) if options.cameras == "refine" else None
     if rig is None:
         (out / FILE_NAME).unlink(missing_ok=True)
         kept = (_why_kept(plan.records),) if options.cameras == "refine" else ()
-        return replace(job, plan=replace(plan, findings=(*plan.findings, *kept)))
-    records = {frame: rig.corrected(found) for frame, found in plan.records.items()}
-    return replace(job, rig=rig, plan=replace(plan, records=records, findings=(*plan.findings, *rig.findings())))
+        return replace(job, plan=replace(job.plan, findings=(*job.plan.findings, *kept)))
+    return replace(job, rig=rig, plan=_corrected(job.plan, rig))
 
 
-def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
+def _corrected(plan: FramePlan, found: MaskCorrections | RigCorrection) -> FramePlan:
+    """Return a plan with corrected records, and what is to be said of that."""
+    records = {frame: found.corrected(rows) for frame, rows in plan.records.items()}
+    return replace(plan, records=records, findings=(*plan.findings, *found.findings()))
+
+
+def _mended_masks(
+    job: _Job, out: Path, reader: FrameReader, read: Callable[[], list[CapturedView]]
+) -> MaskCorrections | None:
+    """Find how far masks are off, or read what was found from the same images before; None for nothing to say."""
+    frame, records = next(iter(job.plan.records.items()))
+    names = [record.camera_name for record in records]
+    if len(set(names)) < len(names):
+        return None
+    key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "masks")
+    known = None
+    with suppress(AssetFormatError):  # what is damaged is found anew
+        known = read_mask_corrections(out, key)
+    if known is None:
+        known = job.steps.mend_masks(names, read(), within(job.progress, "masks", frame))
+        write_json(out / mask_corrections.FILE_NAME, {"key": key, **known.as_dict()})
+    return known
+
+
+def _refined_rig(job: _Job, out: Path, read: Callable[[], list[CapturedView]]) -> RigCorrection | None:
     """Find what is wrong with the cameras, or read what was found from the same images before; None for nothing."""
     frame, records = next(iter(job.plan.records.items()))
     if not _is_fixed_rig(job.plan.records):
@@ -246,7 +287,8 @@ def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
             known = read_corrections(out, key)
         if known is None:
             names = [record.camera_name for record in records]
-            known = job.steps.refine_rig(names, reader.views(frame), within(job.progress, "cameras", frame))
+            views = [taken_in(view, record.mask_excess) for view, record in zip(read(), records, strict=True)]
+            known = job.steps.refine_rig(names, views, within(job.progress, "cameras", frame))
             if known is not None:
                 write_json(out / FILE_NAME, {"key": key, **known.as_dict()})
     return known
@@ -351,9 +393,15 @@ def _report(job: _Job, capture: Capture, options: ReconstructOptions, resumed: i
         },
         "device": device_facts(job.device),
         "versions": versions(),
-        "options": {**job.steps.options(), "segment_length": options.segment_length, "cameras": options.cameras},
+        "options": {
+            **job.steps.options(),
+            "segment_length": options.segment_length,
+            "cameras": options.cameras,
+            "masks": options.masks,
+        },
         "resumed_frames": resumed,
         "cameras": None if job.rig is None else job.rig.as_dict(),
+        "masks": job.masks.as_dict()["cameras"],
         **sequence_facts(frames),
         "findings": [vars(finding) for finding in findings],
         "warnings": [*job.store.notes, *(finding.what for finding in findings), *warnings_of(frames)],

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from beam_warp.capture.capture import SparsePoints
 from beam_warp.capture.corrections import RigCorrection
 from beam_warp.capture.findings import Finding
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
@@ -21,6 +22,7 @@ from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
+from beam_warp.reconstruction.masks import mend_masks
 from beam_warp.reconstruction.rig import refine_rig
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
 from beam_warp.world.gaussians import GaussianCloud
@@ -65,6 +67,12 @@ class FitAndTrack:
             "tracking": asdict(self._tracking),
             "points": None if self.points is None else _digest(self.points),
         }
+
+    def mend_masks(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> MaskCorrections:
+        """Find how far the masks of cut-outs are off, from what they show at one moment."""
+        return mend_masks(names, views, self.fitting, device=self.device, progress=progress)
 
     def refine_rig(
         self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress

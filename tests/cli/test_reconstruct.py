@@ -8,6 +8,7 @@ import pytest
 from support.commands import beam
 from support.fake_steps import FakeSteps, write_capture
 from support.moving_ball import ball_views, rig
+from support.sound_capture import rewrite, write_sound
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.corrections import moved_camera
@@ -94,6 +95,20 @@ def test_mistakes_cost_no_reconstruction(folder, asked, tmp_path, refused, words
     dark = write_capture(tmp_path / "dark", (0,), environment=False)
     words = words.format(folder=folder, dark=dark)
     refused(*words.split(), "--out", tmp_path / "out", says=says)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "says"),
+    [
+        (0, "got 24 images are of nothing, by mask or alpha, and left out"),
+        (255, "got mask or alpha of 24 images of 24 is white everywhere: background counts as the subject does at c00"),
+    ],
+)
+def test_masks_that_tell_nothing_are_named(tmp_path, refused, alpha, says):
+    content = write_sound(tmp_path / "capture", frames=2)
+    for entry in content["frames"]:
+        rewrite(tmp_path / "capture" / entry["file_path"], lambda pixels: pixels[..., 3].fill(alpha))
+    refused("reconstruct", tmp_path / "capture", "--out", tmp_path / "out", says=says)
 
 
 def test_a_run_from_images_to_an_asset_and_again(folder, asked, tmp_path, capsys):

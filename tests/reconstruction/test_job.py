@@ -19,6 +19,8 @@ from support.leftovers import temporary_of_the_dead
 from beam_warp import read, validate
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera, read_corrections
+from beam_warp.capture.mask_corrections import MaskCorrections, read_mask_corrections
+from beam_warp.capture.mattes import MaskOffset
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
@@ -458,3 +460,31 @@ class TestCameras:
 
 def down_of(camera):
     return camera.camera_to_world[:3, 1]
+
+
+class TestMasks:
+    """What is found about masks holds for every frame, is kept beside the result, and is not sought twice."""
+
+    FOUND = MaskCorrections({"c1": MaskOffset(-0.7, 0.1)})
+
+    def test_frames_are_fitted_to_moved_masks(self, capture, tmp_path):
+        steps, again = FakeSteps(), FakeSteps()
+        steps.masks = self.FOUND
+        found = reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        assert steps.mended == [("c0", "c1", "c2")]
+        assert found.report["masks"] == self.FOUND.as_dict()["cameras"]
+        assert "mask-offset" in {finding["code"] for finding in found.report["findings"]}
+        excess = {record.camera_name: record.mask_excess for record in found.capture.records}
+        assert excess == {"c0": 0.0, "c1": -0.7, "c2": 0.0}
+        assert read_mask_corrections(tmp_path / "out") == self.FOUND
+        assert reconstruct(capture, tmp_path / "out", again, BEGINNING).report["masks"] == found.report["masks"]
+        assert (again.mended, again.calls) == ([], [])
+
+    def test_masks_are_kept_if_asked_for(self, capture, tmp_path):
+        steps = FakeSteps()
+        steps.masks = self.FOUND
+        reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        found = reconstruct(capture, tmp_path / "out", steps, replace(BEGINNING, masks="keep"))
+        assert len(steps.mended) == 1
+        assert found.capture is capture
+        assert read_mask_corrections(tmp_path / "out") is None

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from beam_warp.capture.corrections import RigCorrection
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.gaussians import GaussianCloud
@@ -55,6 +56,12 @@ class FrameSteps(Protocol):
 
     def options(self) -> Mapping[str, Any]:
         """Return all that results depend on, but for the device; JSON-able."""
+        ...
+
+    def mend_masks(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> MaskCorrections:
+        """Find how far the masks of the cameras that have these names and took these views are off."""
         ...
 
     def refine_rig(
