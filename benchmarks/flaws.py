@@ -59,7 +59,7 @@ LEAST_PIXELS = 0.1
 """A Gaussian's truth is known where test views show at least so much of it."""
 
 NAMED: Mapping[str, Collection[str]] = {
-    "exposure": ("camera-exposure",),
+    "exposure": ("camera-exposure", "camera-white-balance"),
     "masks": ("mask-offset",),
     "light": ("environment-turned", "environment-exposure"),
     "clipping": ("clipped-images",),
@@ -156,7 +156,33 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
         "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
         "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
+        **gain_errors(copy, reconstruction["exposures"]),
     }
+
+
+def gain_errors(copy: FlawedCapture, exposures: Row | None) -> Row:
+    """Return root mean square errors of the cameras' gains over their mean, in parts: what is left undone, and found.
+
+    ``exposure`` is of the mean of red, green and blue, ``white_balance`` of these over it; ``_found`` before anything
+    is judged, ``_error`` of what was undone.
+    """
+    if exposures is None:
+        return {}
+    flaws = copy.injected["cameras"]
+    kept = exposures["cameras"]
+    balance = np.array([flaws.get(camera["camera"], {}).get("white_balance", (0.0, 0.0)) for camera in kept])
+    true = np.array([flaws.get(camera["camera"], {}).get("exposure_stops", 0.0) for camera in kept])[:, None] * np.log(
+        2.0
+    )
+    true = true + np.log1p(np.stack([balance[:, 0], np.zeros(len(kept)), balance[:, 1]], axis=1))
+    found = np.array([np.array(camera["balance"]) + np.log(2.0) * camera["stops"] for camera in kept])
+    undone = np.log([camera["gains"] for camera in kept])
+    said: Row = {}
+    for word, value in (("found", found), ("error", undone)):
+        off = value - true - (value - true).mean(axis=0)
+        said[f"exposure_{word}"] = float(np.sqrt(np.mean(np.square(off.mean(axis=1)))))
+        said[f"white_balance_{word}"] = float(np.sqrt(np.mean(np.square(off - off.mean(axis=1, keepdims=True)))))
+    return said
 
 
 def in_units_of(sequence: GaussianSequence, white: float) -> GaussianSequence:

@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.corrections import read_corrections
+from beam_warp.capture.exposures import read_exposures
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 from beam_warp.cli.common.pages import SECOND_PAGE
@@ -132,9 +133,10 @@ def decompose(args: Decompose) -> int:
 
 
 def _seen_by(capture: Capture, sequence: Path) -> Capture:
-    """Return a capture with the cameras that a sequence was fitted with, if it lies in a reconstruction's folder."""
-    rig = read_corrections(sequence.parent)
-    return capture if rig is None else rig.capture(capture)
+    """Return a capture with the cameras and colours that a sequence was fitted to, if it is of a reconstruction."""
+    for found in (read_corrections(sequence.parent), read_exposures(sequence.parent)):
+        capture = capture if found is None else found.capture(capture)
+    return capture
 
 
 def light_of(measuring: Measuring, capture: Capture | None, source: Path) -> Path:

@@ -76,7 +76,7 @@ def run(args: Run) -> int:
     )
     view = overview_options(args.measuring)
     with progress(args.quiet or args.json) as report:
-        found = None if capture is None else _reconstruct(args, capture, report)
+        found = None if capture is None else _reconstruct(args, capture, environment, report)
         if found is None:
             sequence = converters.read(
                 args.input,
@@ -128,11 +128,11 @@ def _check_words(args: Run, capture: Capture | None) -> None:
         )
 
 
-def _reconstruct(args: Run, capture: Capture, report: NotedProgress) -> Reconstruction:
+def _reconstruct(args: Run, capture: Capture, environment: EnvironmentMap, report: NotedProgress) -> Reconstruction:
     from beam_warp.jobs.store import make_folders
     from beam_warp.reconstruction.job import reconstruct
 
-    steps = steps_of(args.modelling, capture, args.seed, args.device)
+    steps = steps_of(args.modelling, capture, args.seed, args.device, environment)
     folder = args.out / "reconstruction"
     options = options_of(args.modelling, capture)
     make_folders(args.out)

@@ -7,6 +7,7 @@ tracking is lost becomes a key frame itself.
 
     plan            frames.plan     the records of each frame, and the segments
     cameras         steps.refine_rig   what is wrong with the rig, from its first frame; corrected records
+    exposures       steps.find_exposures  exposures and white balances of the rig, likewise
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
@@ -33,7 +34,9 @@ from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture, CaptureRecord
-from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
+from beam_warp.capture import corrections, exposures
+from beam_warp.capture.corrections import RigCorrection, read_corrections
+from beam_warp.capture.exposures import RigExposures, read_exposures
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
@@ -112,7 +115,7 @@ class Reconstruction:
         asset: Root layer of the asset.
         sequence: The Gaussians, read lazily from the store; axes "rfu", scene-linear radiance.
         report: What was measured, JSON-able; also written to ``report.json``.
-        capture: The capture with the cameras that the Gaussians were fitted with.
+        capture: The capture with the cameras and the colours that the Gaussians were fitted to.
     """
 
     asset: Path
@@ -158,7 +161,9 @@ def reconstruct(
     progress("write asset", 1, 1)
     report = {**_report(job, capture, chosen, resumed), "seconds": time.perf_counter() - started}
     write_report(folder, report)
-    return Reconstruction(asset, sequence, report, capture if job.rig is None else job.rig.capture(capture))
+    for found in (job.rig, job.exposures):
+        capture = capture if found is None else found.capture(capture)
+    return Reconstruction(asset, sequence, report, capture)
 
 
 def reconstruct_part(
@@ -212,6 +217,7 @@ class _Job:
     common_inputs: str
     progress: NotedProgress
     rig: RigCorrection | None = None
+    exposures: RigExposures | None = None
 
 
 def _prepare(
@@ -223,12 +229,20 @@ def _prepare(
         require_writable(out / name, is_made=True)
     plan = plan_frames(capture, options.frames, options.segment_length)
     job = _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
-    rig = _refined_rig(job, out) if options.cameras == "refine" else None
-    if rig is None:
-        (out / FILE_NAME).unlink(missing_ok=True)
-        return job
-    records = {frame: rig.corrected(found) for frame, found in plan.records.items()}
-    return replace(job, rig=rig, plan=replace(plan, records=records, findings=(*plan.findings, *rig.findings())))
+    if options.cameras == "refine" and (rig := _refined_rig(job, out)) is not None:
+        job = replace(job, rig=rig, plan=_corrected(plan, rig))
+    else:
+        (out / corrections.FILE_NAME).unlink(missing_ok=True)
+    if (found := _found_exposures(job, out)) is not None:
+        return replace(job, exposures=found, plan=_corrected(job.plan, found))
+    (out / exposures.FILE_NAME).unlink(missing_ok=True)
+    return job
+
+
+def _corrected(plan: FramePlan, found: RigCorrection | RigExposures) -> FramePlan:
+    """Return a plan with the records corrected, and what was found said."""
+    records = {frame: found.corrected(records) for frame, records in plan.records.items()}
+    return replace(plan, records=records, findings=(*plan.findings, *found.findings()))
 
 
 def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
@@ -245,7 +259,26 @@ def _refined_rig(job: _Job, out: Path) -> RigCorrection | None:
             names = [record.camera_name for record in records]
             known = job.steps.refine_rig(names, reader.views(frame), within(job.progress, "cameras", frame))
             if known is not None:
-                write_json(out / FILE_NAME, {"key": key, **known.as_dict()})
+                write_json(out / corrections.FILE_NAME, {"key": key, **known.as_dict()})
+    return known
+
+
+def _found_exposures(job: _Job, out: Path) -> RigExposures | None:
+    """Find exposures and white balances, or read what was found from the same images before; None for nothing."""
+    frame, records = next(iter(job.plan.records.items()))
+    if not _is_fixed_rig(job.plan.records):
+        return None
+    with FrameReader(job.plan.records, job.store.digests) as reader:
+        key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "exposures")
+        known = None
+        with suppress(AssetFormatError):  # what is damaged is found anew
+            known = read_exposures(out, key)
+        if known is None:
+            names = [record.camera_name for record in records]
+            progress = within(job.progress, "exposures", frame)
+            known = job.steps.find_exposures(names, reader.views(frame), progress)
+            if known is not None:
+                write_json(out / exposures.FILE_NAME, {"key": key, **known.as_dict()})
     return known
 
 
@@ -337,6 +370,7 @@ def _report(job: _Job, capture: Capture, options: ReconstructOptions, resumed: i
         "options": {**job.steps.options(), "segment_length": options.segment_length, "cameras": options.cameras},
         "resumed_frames": resumed,
         "cameras": None if job.rig is None else job.rig.as_dict(),
+        "exposures": None if job.exposures is None else job.exposures.as_dict(),
         **sequence_facts(frames),
         "findings": [vars(finding) for finding in findings],
         "warnings": [*job.store.notes, *(finding.what for finding in findings), *warnings_of(frames)],

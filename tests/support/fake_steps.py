@@ -69,6 +69,7 @@ class FakeSteps:
     device = "cpu"
     raster = RasterOptions(antialiased=True)
     rig = None
+    exposures = None
 
     def __init__(self, count=60, seed=0):
         self.count, self.seed = count, seed
@@ -81,6 +82,10 @@ class FakeSteps:
         """What the test says, in ``rig``."""
         self.refined.append(tuple(names))
         return self.rig
+
+    def find_exposures(self, names, views, progress):
+        """What the test says, in ``exposures``."""
+        return self.exposures
 
     def begin(self, views, progress):
         level = self.level(views)
