@@ -1,7 +1,7 @@
 """Exposures and white balances of a rig's cameras: what they are, how sure, where they are kept, and what they undo.
 
 Reconstruction finds them (`beam_warp.reconstruction.photometry`) and writes them beside its result, so that whatever
-goes back to the photographs later sees the colours that the Gaussians were fitted to. Only training records are changed.
+goes back to the photographs later sees the colours that the Gaussians were fitted to. Only training records change.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.findings import Finding
@@ -35,17 +36,13 @@ class CameraExposure:
     Attributes:
         camera: Name of the camera.
         stops: Exposure, the mean of the three channels' [stop].
-        error: Standard error of that [stop].
         balance: Natural logarithms of the gains of red, green and blue over their mean, ``(3,)``.
-        balance_error: Standard error of these, root mean square.
         gains: Factors of red, green and blue that are undone, ``(3,)``; 1 for what is not beyond chance.
     """
 
     camera: str
     stops: float = 0.0
-    error: float = 0.0
     balance: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    balance_error: float = 0.0
     gains: tuple[float, float, float] = NEUTRAL
 
     def __post_init__(self) -> None:
@@ -54,8 +51,7 @@ class CameraExposure:
             vector = require_array(name, getattr(self, name), (3,), np.float64)
             require_finite(name, vector)
             object.__setattr__(self, name, tuple(vector.tolist()))
-        for name, low, high in (("stops", -64.0, 64.0), ("error", 0.0, 64.0), ("balance_error", 0.0, 64.0)):
-            require_number(name, getattr(self, name), low, high)
+        require_number("stops", self.stops, -64.0, 64.0)
         for gain in self.gains:
             require_number("gain", gain, 2.0**-64, 2.0**64)
 
@@ -66,11 +62,15 @@ class RigExposures:
 
     Attributes:
         cameras: One for each camera.
+        exposure_error: Standard error of exposures, root mean square over the cameras [stop].
+        balance_error: Likewise of white balances.
         exposure_undone: Whether differences of exposure are beyond chance, and undone.
         balance_undone: Likewise of white balance.
     """
 
     cameras: tuple[CameraExposure, ...]
+    exposure_error: float = 0.0
+    balance_error: float = 0.0
     exposure_undone: bool = False
     balance_undone: bool = False
 
@@ -93,19 +93,16 @@ class RigExposures:
         found = []
         if self.exposure_undone:
             most = max(self.cameras, key=lambda camera: abs(camera.stops))
-            spread, error = (_root_mean_square(self.cameras, name) for name in ("stops", "error"))
             what = (
-                f"exposures of cameras differ by {spread:.2f} ± {error:.2f} stops, at most {most.stops:+.2f}, and were "
-                "matched"
+                f"exposures of cameras differ by {_spread([camera.stops for camera in self.cameras]):.2f} ± "
+                f"{self.exposure_error:.2f} stops, at most {most.stops:+.2f}, and were matched"
             )
             found.append(Finding("warning", "camera-exposure", what, most.camera, "Match exposures before."))
         if self.balance_undone:
-            most = max(self.cameras, key=lambda camera: float(np.abs(camera.balance).max()))
-            spread = 100.0 * float(np.sqrt(np.mean([np.square(camera.balance) for camera in self.cameras])))
-            error = 100.0 * _root_mean_square(self.cameras, "balance_error")
+            most = max(self.cameras, key=lambda camera: _largest(camera.balance))
             what = (
-                f"white balances of cameras differ by {spread:.1f} ± {error:.1f} %, at most "
-                f"{100.0 * float(np.abs(most.balance).max()):.1f} %, and were matched"
+                f"white balances of cameras differ by {100.0 * _spread([c.balance for c in self.cameras]):.1f} ± "
+                f"{100.0 * self.balance_error:.1f} %, at most {100.0 * _largest(most.balance):.1f} %, and were matched"
             )
             found.append(Finding("warning", "camera-white-balance", what, most.camera, "Match white balances before."))
         return found
@@ -123,7 +120,8 @@ class RigExposures:
         """
         try:
             cameras = tuple(CameraExposure(**camera) for camera in content["cameras"])
-            return cls(cameras, bool(content["exposure_undone"]), bool(content["balance_undone"]))
+            errors = (require_number(name, content[name], 0.0) for name in ("exposure_error", "balance_error"))
+            return cls(cameras, *errors, bool(content["exposure_undone"]), bool(content["balance_undone"]))
         except (BeamError, KeyError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise AssetFormatError(
@@ -153,5 +151,9 @@ def read_exposures(folder: Path, key: str | None = None) -> RigExposures | None:
     return found if key is None or content.get("key") == key else None
 
 
-def _root_mean_square(cameras: Sequence[CameraExposure], name: str) -> float:
-    return float(np.sqrt(np.mean([getattr(camera, name) ** 2 for camera in cameras])))
+def _spread(values: Sequence[ArrayLike]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _largest(balance: Sequence[float]) -> float:
+    return max(abs(value) for value in balance)

@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp import converters
-from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture import corrections, exposures
+from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import RigCorrection, read_corrections
 from beam_warp.capture.exposures import RigExposures, read_exposures
 from beam_warp.capture.views import CapturedView
