@@ -18,7 +18,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -147,42 +147,45 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
     """Return parameters that the product reports, beside those that were injected.
 
     ``light_stops``: how much brighter the light was made; it should be minus what was injected.
-    ``exposure_spread``: largest exposure of a camera over the middle one [stop]; 0 where none is known.
+    ``exposure_spread``: largest exposure of a camera over the mean [stop]; 0 where none is known.
     """
     stops = [flaws.get("exposure_stops", 0.0) for flaws in copy.injected["cameras"].values()]
-    spreads = [frame["exposure_spread"] for frame in reconstruction["frames"] if "exposure_spread" in frame]
+    exposures = reconstruction["exposures"]
+    spreads = [] if exposures is None else [abs(camera["stops"]) for camera in exposures["cameras"]]
     return {
         "light_stops": decomposition["exposure_stops"],
         "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
         "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
-        **gain_errors(copy, reconstruction["exposures"]),
+        **({} if exposures is None else gain_errors(copy.injected["cameras"], exposures["cameras"])),
     }
 
 
-def gain_errors(copy: FlawedCapture, exposures: Row | None) -> Row:
-    """Return root mean square errors of the cameras' gains over their mean, in parts: what is left undone, and found.
+def gain_errors(injected: Row, cameras: Sequence[Row]) -> dict[str, float]:
+    """Return root mean square errors of the cameras' gains over those of the rig, natural logarithms.
 
-    ``exposure`` is of the mean of red, green and blue, ``white_balance`` of these over it; ``_found`` before anything
-    is judged, ``_error`` of what was undone.
+    ``exposure`` is the mean of red, green and blue, ``white_balance`` what these differ from it. ``found`` is before
+    anything is judged, ``error`` what is left where it was undone.
+
+    Args:
+        injected: Flaws of each camera that has some, by name.
+        cameras: What was found of each.
     """
-    if exposures is None:
-        return {}
-    flaws = copy.injected["cameras"]
-    kept = exposures["cameras"]
-    balance = np.array([flaws.get(camera["camera"], {}).get("white_balance", (0.0, 0.0)) for camera in kept])
-    true = np.array([flaws.get(camera["camera"], {}).get("exposure_stops", 0.0) for camera in kept])[:, None] * np.log(
-        2.0
-    )
-    true = true + np.log1p(np.stack([balance[:, 0], np.zeros(len(kept)), balance[:, 1]], axis=1))
-    found = np.array([np.array(camera["balance"]) + np.log(2.0) * camera["stops"] for camera in kept])
-    undone = np.log([camera["gains"] for camera in kept])
-    said: Row = {}
-    for word, value in (("found", found), ("error", undone)):
-        off = value - true - (value - true).mean(axis=0)
-        said[f"exposure_{word}"] = float(np.sqrt(np.mean(np.square(off.mean(axis=1)))))
-        said[f"white_balance_{word}"] = float(np.sqrt(np.mean(np.square(off - off.mean(axis=1, keepdims=True)))))
-    return said
+    true, found, undone = [], [], []
+    for camera in cameras:
+        flaws = injected.get(camera["camera"], {})
+        red, blue = flaws.get("white_balance", (0.0, 0.0))
+        true.append(np.log(2.0) * flaws.get("exposure_stops", 0.0) + np.log1p([red, 0.0, blue]))
+        found.append(np.log(2.0) * camera["stops"] + np.array(camera["balance"]))
+        undone.append(np.log(camera["gains"]))
+    errors = {}
+    for word, logs in (("found", found), ("error", undone)):
+        off = np.stack(logs) - np.stack(true)
+        off -= off.mean(axis=0)
+        exposure = off.mean(axis=1, keepdims=True)
+        errors[f"exposure_{word}"] = float(np.sqrt(np.mean(np.square(exposure))))
+        errors[f"white_balance_{word}"] = float(np.sqrt(np.mean(np.square(off - exposure))))
+    return errors
 
 
 def in_units_of(sequence: GaussianSequence, white: float) -> GaussianSequence:

@@ -42,6 +42,11 @@ class Modelling:
         arg(help="Correct cameras that are beyond doubt wrong, or keep all as the capture states them."),
         SECOND_PAGE,
     ] = "refine"
+    exposures: Annotated[
+        Literal["match", "keep"],
+        arg(help="Match exposures and white balances that differ beyond chance, or keep all as photographed."),
+        SECOND_PAGE,
+    ] = "match"
     frames: Annotated[
         str | None, arg(metavar="A:B", help="Frames A to B - 1 of the capture; A:B:S takes every S-th of them.")
     ] = None
@@ -140,7 +145,9 @@ def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
     from beam_warp.reconstruction.job import ReconstructOptions
 
     frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
-    return ReconstructOptions(segment_length=modelling.segment_length, frames=frames, cameras=modelling.cameras)
+    return ReconstructOptions(
+        segment_length=modelling.segment_length, frames=frames, cameras=modelling.cameras, exposures=modelling.exposures
+    )
 
 
 def frames_of(words: str, there: tuple[int, ...]) -> tuple[int, ...]:

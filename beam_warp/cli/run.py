@@ -117,8 +117,8 @@ def _check_words(args: Run, capture: Capture | None) -> None:
     """Refuse words that do not go with the input."""
     if capture is None and args.modelling != Modelling():
         raise InvalidOptionError(
-            "gaussians, target-psnr, preset, segment-length, cameras and frames must be left out unless the input is a "
-            f"capture, got {args.input}. Drop them."
+            "gaussians, target-psnr, preset, segment-length, cameras, exposures and frames must be left out unless the "
+            f"input is a capture, got {args.input}. Drop them."
         )
     of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)
     if capture is not None and any(value is not None for value in of_files):

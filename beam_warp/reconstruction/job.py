@@ -68,16 +68,20 @@ class ReconstructOptions:
         frames: Numbers of the frames, ascending; None for all of the split.
         cameras: ``"refine"`` corrects cameras that are beyond doubt wrong, the same in all frames; ``"keep"`` takes all
             as the capture states them.
+        exposures: ``"match"`` undoes differences of exposure and white balance between cameras that are beyond doubt,
+            the same in all frames; ``"keep"`` takes all colours as photographed.
     """
 
     segment_length: int = 0
     frames: tuple[int, ...] | None = None
     cameras: Literal["refine", "keep"] = "refine"
+    exposures: Literal["match", "keep"] = "match"
 
     def __post_init__(self) -> None:
         """Check every field once."""
         require_count("segment_length", self.segment_length, low=0)
         require_choice("cameras", self.cameras, ("refine", "keep"))
+        require_choice("exposures", self.exposures, ("match", "keep"))
         if self.frames is not None and list(self.frames) != sorted(set(self.frames)):
             raise InvalidOptionError(
                 f"frames must be ascending and each there once, got {str(self.frames)[:60]}. Sort them."
@@ -233,7 +237,7 @@ def _prepare(
         job = replace(job, rig=rig, plan=_corrected(plan, rig))
     else:
         (out / corrections.FILE_NAME).unlink(missing_ok=True)
-    if (found := _found_exposures(job, out)) is not None:
+    if options.exposures == "match" and (found := _found_exposures(job, out)) is not None:
         return replace(job, exposures=found, plan=_corrected(job.plan, found))
     (out / exposures.FILE_NAME).unlink(missing_ok=True)
     return job
@@ -367,7 +371,12 @@ def _report(job: _Job, capture: Capture, options: ReconstructOptions, resumed: i
         },
         "device": device_facts(job.device),
         "versions": versions(),
-        "options": {**job.steps.options(), "segment_length": options.segment_length, "cameras": options.cameras},
+        "options": {
+            **job.steps.options(),
+            "segment_length": options.segment_length,
+            "cameras": options.cameras,
+            "exposures": options.exposures,
+        },
         "resumed_frames": resumed,
         "cameras": None if job.rig is None else job.rig.as_dict(),
         "exposures": None if job.exposures is None else job.exposures.as_dict(),
