@@ -247,15 +247,18 @@ class _Solver:
         self._chances = np.full(kinds, 1.0 / (kinds + 1))
         self._factors = self._weights / LEAST_SPREAD**2
         self._logs = np.zeros(3 * views)
-        self._held = np.eye(3 * views) - np.kron(np.full((views, views), 1.0 / views), np.eye(3))
+        self._known = np.flatnonzero(self._weights.any(axis=0))
+        shared = max(len(self._known) // 3, 1)
+        self._held = np.eye(3 * shared) - np.kron(np.full((shared, shared), 1.0 / shared), np.eye(3))
 
     def solve(self) -> NDArray[np.float64]:
-        """Return the logarithms of the gains, ``(V, 3)``."""
+        """Return the logarithms of the gains, ``(V, 3)``; 0 of views that see nothing."""
         for _ in range(ROUNDS):
             matrix, right = self._round()
-            change = np.linalg.lstsq(self._held @ matrix @ self._held, self._held @ right, rcond=1e-9)[0]
-            self._logs = self._logs + change
-            if np.abs(change).max() < SETTLED:
+            among = self._held @ matrix[np.ix_(self._known, self._known)] @ self._held
+            change = np.linalg.lstsq(among, self._held @ right[self._known], rcond=1e-9)[0]
+            self._logs[self._known] += change
+            if np.abs(change).max(initial=0.0) < SETTLED:
                 break
         return self._logs.reshape(-1, 3)
 
