@@ -183,8 +183,8 @@ class TestOutputs:
 
         monkeypatch.setattr(CaptureRecord, "view", counted)
         reconstruct(capture, tmp_path / "out", FakeSteps())
-        # Once to inspect the capture, once for fit, tracking and previews, and the first frame for its cameras.
-        assert len(most) == 2 * 3 * len(FRAMES) + 3
+        # Once to inspect the capture, once for fit, tracking and previews, and the first for its cameras and exposures.
+        assert len(most) == 2 * 3 * len(FRAMES) + 2 * 3
         gc.collect()
         assert max(most) <= 2 * 3
         assert not alive

@@ -114,7 +114,8 @@ def test_a_uniform_light_is_mirrored_as_the_albedo_says():
 
 
 def test_a_sound_capture_is_left_alone(tiny_capture, monkeypatch):
-    """The points are those of the visual hull here: a fit takes long."""
+    """The points are those of the visual hull here, for a fit takes long; of six cameras few see one of them."""
+    monkeypatch.setattr(photometry, "LEAST_VIEWS", 2)
     monkeypatch.setattr(photometry, "fit_gaussians", lambda views, start, *args, **more: Fit(start))
     records = tiny_capture.select(split="train", frames=[0])
     views, names = [record.view() for record in records], [record.camera_name for record in records]
