@@ -120,8 +120,9 @@ class RigExposures:
         """
         try:
             cameras = tuple(CameraExposure(**camera) for camera in content["cameras"])
-            errors = (require_number(name, content[name], 0.0) for name in ("exposure_error", "balance_error"))
-            return cls(cameras, *errors, bool(content["exposure_undone"]), bool(content["balance_undone"]))
+            errors = {name: require_number(name, content[name], 0.0) for name in ("exposure_error", "balance_error")}
+            undone = {name: bool(content[name]) for name in ("exposure_undone", "balance_undone")}
+            return cls(cameras, **errors, **undone)
         except (BeamError, KeyError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise AssetFormatError(
@@ -151,8 +152,8 @@ def read_exposures(folder: Path, key: str | None = None) -> RigExposures | None:
     return found if key is None or content.get("key") == key else None
 
 
-def _spread(values: Sequence[ArrayLike]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+def _spread(values: ArrayLike) -> float:
+    return float(np.sqrt(np.mean(np.square(np.asarray(values)))))
 
 
 def _largest(balance: Sequence[float]) -> float:
