@@ -63,7 +63,7 @@ LEAST_PIXELS = 0.1
 """A Gaussian's truth is known where test views show at least so much of it."""
 
 NAMED: Mapping[str, Collection[str]] = {
-    "exposure": ("camera-exposure",),
+    "exposure": ("camera-exposure", "camera-white-balance"),
     "masks": ("mask-offset",),
     "cutouts": ("mask-offset",),
     "light": ("environment-turned", "environment-exposure"),
@@ -155,15 +155,17 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
     """Return parameters that the product reports, beside those that were injected.
 
     ``light_stops``: how much brighter the light was made; it should be minus what was injected.
-    ``exposure_spread``: largest exposure of a camera over the middle one [stop]; 0 where none is known.
+    ``exposure_spread``: largest exposure of a camera over the mean [stop]; 0 where none is known.
     """
     stops = [flaws.get("exposure_stops", 0.0) for flaws in copy.injected["cameras"].values()]
-    spreads = [frame["exposure_spread"] for frame in reconstruction["frames"] if "exposure_spread" in frame]
+    exposures = reconstruction["exposures"]
+    spreads = [] if exposures is None else [abs(camera["stops"]) for camera in exposures["cameras"]]
     return {
         "light_stops": decomposition["exposure_stops"],
         "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
         "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
+        **({} if exposures is None else gain_errors(copy.injected["cameras"], exposures["cameras"])),
     }
 
 
@@ -205,6 +207,33 @@ def apart(
     moves, world = in_gauge(true, moves, points, ("turn", "shift"))
     pixels = [pixels_of(*pair, points) for pair in zip(true, moves, strict=True)]
     return float(np.sqrt(np.mean(np.square(pixels)))), float(np.sqrt(np.square(moves[:, 3:6]).sum(1).mean())), world
+
+
+def gain_errors(injected: Row, cameras: Sequence[Row]) -> dict[str, float]:
+    """Return root mean square errors of the cameras' gains over those of the rig, natural logarithms.
+
+    ``exposure`` is the mean of red, green and blue, ``white_balance`` what these differ from it. ``found`` is before
+    anything is judged, ``error`` what is left where it was undone.
+
+    Args:
+        injected: Flaws of each camera that has some, by name.
+        cameras: What was found of each.
+    """
+    true, found, undone = [], [], []
+    for camera in cameras:
+        flaws = injected.get(camera["camera"], {})
+        red, blue = flaws.get("white_balance", (0.0, 0.0))
+        true.append(np.log(2.0) * flaws.get("exposure_stops", 0.0) + np.log1p([red, 0.0, blue]))
+        found.append(np.log(2.0) * camera["stops"] + np.array(camera["balance"]))
+        undone.append(np.log(camera["gains"]))
+    errors = {}
+    for word, logs in (("found", found), ("error", undone)):
+        off = np.stack(logs) - np.stack(true)
+        off -= off.mean(axis=0)
+        exposure = off.mean(axis=1, keepdims=True)
+        errors[f"exposure_{word}"] = float(np.sqrt(np.mean(np.square(exposure))))
+        errors[f"white_balance_{word}"] = float(np.sqrt(np.mean(np.square(off - exposure))))
+    return errors
 
 
 def in_units_of(sequence: GaussianSequence, white: float) -> GaussianSequence:

@@ -78,6 +78,7 @@ class CaptureRecord:
         relit_paths: Exact images under other lights, by the name of the light.
         undistortion: Undistortion of all files as they are read; None if a pinhole took them.
         mask_excess: How far coverage reaches beyond the subject [pixel of `view`], which is taken in as it is read.
+        gains: Factors of red, green and blue that the camera is known to be off by; `view` undoes them.
     """
 
     camera_name: str
@@ -93,6 +94,7 @@ class CaptureRecord:
     relit_paths: Mapping[str, Path] = field(default_factory=dict)
     undistortion: Undistortion | None = None
     mask_excess: float = 0.0
+    gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def name(self) -> str:
@@ -156,6 +158,8 @@ class CaptureRecord:
                 f"at {self.image_path}. Export it again, or repair those pixels."
             )
         color = rgba[..., :3]
+        if self.gains != (1.0, 1.0, 1.0):
+            color = color / np.array(self.gains, np.float32)
         found = CapturedView(name=self.name, camera=self.camera, color=color, alpha=alpha, mask_offset=offset)
         return taken_in(found, self.mask_excess)
 

@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.corrections import read_corrections
+from beam_warp.capture.exposures import read_exposures
 from beam_warp.capture.mask_corrections import read_mask_corrections
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
@@ -133,10 +134,11 @@ def decompose(args: Decompose) -> int:
 
 
 def _seen_by(capture: Capture, sequence: Path) -> Capture:
-    """Return a capture with the cameras and masks that a sequence in a reconstruction's folder was fitted with."""
-    masks, rig = read_mask_corrections(sequence.parent), read_corrections(sequence.parent)
-    capture = capture if masks is None else masks.capture(capture)
-    return capture if rig is None else rig.capture(capture)
+    """Return a capture with the cameras, masks and colours that a reconstruction's sequence was fitted with."""
+    for read in (read_mask_corrections, read_corrections, read_exposures):
+        found = read(sequence.parent)
+        capture = capture if found is None else found.capture(capture)
+    return capture
 
 
 def light_of(measuring: Measuring, capture: Capture | None, source: Path) -> Path:

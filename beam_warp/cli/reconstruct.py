@@ -13,6 +13,7 @@ from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
+from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
     from beam_warp.reconstruction.frames.protocols import FrameSteps
@@ -46,6 +47,11 @@ class Modelling:
         arg(help="Move masks of cut-outs that are beyond doubt wrong, or keep all as they are."),
         SECOND_PAGE,
     ] = "refine"
+    exposures: Annotated[
+        Literal["match", "keep"],
+        arg(help="Match exposures and white balances that differ beyond chance, or keep all as photographed."),
+        SECOND_PAGE,
+    ] = "match"
     frames: Annotated[
         str | None, arg(metavar="A:B", help="Frames A to B - 1 of the capture; A:B:S takes every S-th of them.")
     ] = None
@@ -79,7 +85,8 @@ def reconstruct(args: Reconstruct) -> int:
     part = None if args.part is None else part_of(args.part)
     capture = Capture.read(args.capture)
     options = options_of(args.modelling, capture)
-    steps = steps_of(args.modelling, capture, args.seed, args.device)
+    light = None if capture.environment_path is None else EnvironmentMap.read(capture.environment_path)
+    steps = steps_of(args.modelling, capture, args.seed, args.device, light)
 
     from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
     from beam_warp.reconstruction.job import reconstruct_part
@@ -117,8 +124,10 @@ def summary(report: dict[str, Any]) -> str:
     return ", ".join([*words, f"{report['seconds']:.1f} s on {report['device']['name']}"])
 
 
-def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | None) -> FrameSteps:
-    """Return the steps that the words ask for."""
+def steps_of(
+    modelling: Modelling, capture: Capture, seed: int, device: str | None, environment: EnvironmentMap | None
+) -> FrameSteps:
+    """Return the steps that the words ask for, under a light that is known or not."""
     from beam_warp.reconstruction.fit import FitOptions
     from beam_warp.reconstruction.steps import FitAndTrack
     from beam_warp.reconstruction.track import TrackOptions
@@ -131,6 +140,7 @@ def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | No
         fitting=FitOptions.of_preset(modelling.preset, **asked),
         tracking=replace(tracking, refinement=replace(tracking.refinement, seed=seed)),
         points=capture.points(),
+        environment=environment,
         device=device,
     )
 
@@ -141,7 +151,11 @@ def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
 
     frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
     return ReconstructOptions(
-        segment_length=modelling.segment_length, frames=frames, cameras=modelling.cameras, masks=modelling.masks
+        segment_length=modelling.segment_length,
+        frames=frames,
+        cameras=modelling.cameras,
+        masks=modelling.masks,
+        exposures=modelling.exposures,
     )
 
 

@@ -76,7 +76,7 @@ def run(args: Run) -> int:
     )
     view = overview_options(args.measuring)
     with progress(args.quiet or args.json) as report:
-        found = None if capture is None else _reconstruct(args, capture, report)
+        found = None if capture is None else _reconstruct(args, capture, environment, report)
         if found is None:
             sequence = converters.read(
                 args.input,
@@ -117,8 +117,8 @@ def _check_words(args: Run, capture: Capture | None) -> None:
     """Refuse words that do not go with the input."""
     if capture is None and args.modelling != Modelling():
         raise InvalidOptionError(
-            "gaussians, target-psnr, preset, segment-length, cameras, masks and frames must be left out unless the "
-            f"input is a capture, got {args.input}. Drop them."
+            "gaussians, target-psnr, preset, segment-length, cameras, masks, exposures and frames must be left out "
+            f"unless the input is a capture, got {args.input}. Drop them."
         )
     of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)
     if capture is not None and any(value is not None for value in of_files):
@@ -128,11 +128,11 @@ def _check_words(args: Run, capture: Capture | None) -> None:
         )
 
 
-def _reconstruct(args: Run, capture: Capture, report: NotedProgress) -> Reconstruction:
+def _reconstruct(args: Run, capture: Capture, environment: EnvironmentMap, report: NotedProgress) -> Reconstruction:
     from beam_warp.jobs.store import make_folders
     from beam_warp.reconstruction.job import reconstruct
 
-    steps = steps_of(args.modelling, capture, args.seed, args.device)
+    steps = steps_of(args.modelling, capture, args.seed, args.device, environment)
     folder = args.out / "reconstruction"
     options = options_of(args.modelling, capture)
     make_folders(args.out)

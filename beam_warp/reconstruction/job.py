@@ -8,6 +8,7 @@ tracking is lost becomes a key frame itself.
     plan            frames.plan     the records of each frame, and the segments
     masks           steps.mend_masks   how far cut-outs are off, from the first frame; corrected records
     cameras         steps.refine_rig   what is wrong with the rig, from its first frame; corrected records
+    exposures       steps.find_exposures  exposures and white balances of the rig, likewise
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
@@ -34,10 +35,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp import converters
-from beam_warp.capture import mask_corrections
+from beam_warp.capture import corrections, exposures, mask_corrections
 from beam_warp.capture.capture import Capture, CaptureRecord
-from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
+from beam_warp.capture.corrections import RigCorrection, read_corrections
 from beam_warp.capture.cutouts import taken_in
+from beam_warp.capture.exposures import RigExposures, read_exposures
 from beam_warp.capture.findings import Finding
 from beam_warp.capture.mask_corrections import MaskCorrections, read_mask_corrections
 from beam_warp.capture.views import CapturedView
@@ -74,18 +76,22 @@ class ReconstructOptions:
             as the capture states them.
         masks: ``"refine"`` moves masks of cut-outs that are beyond doubt wrong, those of a camera the same in all
             frames; ``"keep"`` takes all as they are.
+        exposures: ``"match"`` undoes differences of exposure and white balance between cameras that are beyond doubt,
+            the same in all frames; ``"keep"`` takes all colours as photographed.
     """
 
     segment_length: int = 0
     frames: tuple[int, ...] | None = None
     cameras: Literal["refine", "keep"] = "refine"
     masks: Literal["refine", "keep"] = "refine"
+    exposures: Literal["match", "keep"] = "match"
 
     def __post_init__(self) -> None:
         """Check every field once."""
         require_count("segment_length", self.segment_length, low=0)
         for name in ("cameras", "masks"):
             require_choice(name, getattr(self, name), ("refine", "keep"))
+        require_choice("exposures", self.exposures, ("match", "keep"))
         if self.frames is not None and list(self.frames) != sorted(set(self.frames)):
             raise InvalidOptionError(
                 f"frames must be ascending and each there once, got {str(self.frames)[:60]}. Sort them."
@@ -123,7 +129,7 @@ class Reconstruction:
         asset: Root layer of the asset.
         sequence: The Gaussians, read lazily from the store; axes "rfu", scene-linear radiance.
         report: What was measured, JSON-able; also written to ``report.json``.
-        capture: The capture with the cameras and masks that the Gaussians were fitted with.
+        capture: The capture with the cameras, masks and colours that the Gaussians were fitted with.
     """
 
     asset: Path
@@ -169,8 +175,9 @@ def reconstruct(
     progress("write asset", 1, 1)
     report = {**_report(job, capture, chosen, resumed), "seconds": time.perf_counter() - started}
     write_report(folder, report)
-    seen = job.masks.capture(capture)
-    return Reconstruction(asset, sequence, report, seen if job.rig is None else job.rig.capture(seen))
+    for found in (job.masks, job.rig, job.exposures):
+        capture = capture if found is None else found.capture(capture)
+    return Reconstruction(asset, sequence, report, capture)
 
 
 def reconstruct_part(
@@ -225,6 +232,7 @@ class _Job:
     progress: NotedProgress
     masks: MaskCorrections = field(default_factory=MaskCorrections)
     rig: RigCorrection | None = None
+    exposures: RigExposures | None = None
 
 
 def _prepare(
@@ -238,20 +246,23 @@ def _prepare(
     job = _Job(plan, steps, device, FrameStore(out), common_inputs(steps, device), progress)
     with FrameReader(plan.records, job.store.digests) as reader:
         read = cache(lambda: reader.views(next(iter(plan.records))))
-        masks = _mended_masks(job, out, reader, read) if options.masks == "refine" else None
-        if masks is None:
-            (out / mask_corrections.FILE_NAME).unlink(missing_ok=True)
-        else:
+        if options.masks == "refine" and (masks := _mended_masks(job, out, reader, read)) is not None:
             job = replace(job, masks=masks, plan=_corrected(job.plan, masks))
-        rig = _refined_rig(job, out, read) if options.cameras == "refine" else None
-    if rig is None:
-        (out / FILE_NAME).unlink(missing_ok=True)
-        kept = (_why_kept(plan.records),) if options.cameras == "refine" else ()
-        return replace(job, plan=replace(job.plan, findings=(*job.plan.findings, *kept)))
-    return replace(job, rig=rig, plan=_corrected(job.plan, rig))
+        else:
+            (out / mask_corrections.FILE_NAME).unlink(missing_ok=True)
+        if options.cameras == "refine" and (rig := _refined_rig(job, out, read)) is not None:
+            job = replace(job, rig=rig, plan=_corrected(job.plan, rig))
+        else:
+            (out / corrections.FILE_NAME).unlink(missing_ok=True)
+            kept = (_why_kept(plan.records),) if options.cameras == "refine" else ()
+            job = replace(job, plan=replace(job.plan, findings=(*job.plan.findings, *kept)))
+    if options.exposures == "match" and (found := _found_exposures(job, out)) is not None:
+        return replace(job, exposures=found, plan=_corrected(job.plan, found))
+    (out / exposures.FILE_NAME).unlink(missing_ok=True)
+    return job
 
 
-def _corrected(plan: FramePlan, found: MaskCorrections | RigCorrection) -> FramePlan:
+def _corrected(plan: FramePlan, found: MaskCorrections | RigCorrection | RigExposures) -> FramePlan:
     """Return a plan with corrected records, and what is to be said of that."""
     records = {frame: found.corrected(rows) for frame, rows in plan.records.items()}
     return replace(plan, records=records, findings=(*plan.findings, *found.findings()))
@@ -290,7 +301,26 @@ def _refined_rig(job: _Job, out: Path, read: Callable[[], list[CapturedView]]) -
             views = [taken_in(view, record.mask_excess) for view, record in zip(read(), records, strict=True)]
             known = job.steps.refine_rig(names, views, within(job.progress, "cameras", frame))
             if known is not None:
-                write_json(out / FILE_NAME, {"key": key, **known.as_dict()})
+                write_json(out / corrections.FILE_NAME, {"key": key, **known.as_dict()})
+    return known
+
+
+def _found_exposures(job: _Job, out: Path) -> RigExposures | None:
+    """Find exposures and white balances, or read what was found from the same images before; None for nothing."""
+    frame, records = next(iter(job.plan.records.items()))
+    if not _is_fixed_rig(job.plan.records):
+        return None
+    with FrameReader(job.plan.records, job.store.digests) as reader:
+        key = key_of_frame(job.common_inputs, frame, reader.digest(frame), "exposures")
+        known = None
+        with suppress(AssetFormatError):  # what is damaged is found anew
+            known = read_exposures(out, key)
+        if known is None:
+            names = [record.camera_name for record in records]
+            progress = within(job.progress, "exposures", frame)
+            known = job.steps.find_exposures(names, reader.views(frame), progress)
+            if known is not None:
+                write_json(out / exposures.FILE_NAME, {"key": key, **known.as_dict()})
     return known
 
 
@@ -398,10 +428,12 @@ def _report(job: _Job, capture: Capture, options: ReconstructOptions, resumed: i
             "segment_length": options.segment_length,
             "cameras": options.cameras,
             "masks": options.masks,
+            "exposures": options.exposures,
         },
         "resumed_frames": resumed,
         "cameras": None if job.rig is None else job.rig.as_dict(),
         "masks": job.masks.as_dict()["cameras"],
+        "exposures": None if job.exposures is None else job.exposures.as_dict(),
         **sequence_facts(frames),
         "findings": [vars(finding) for finding in findings],
         "warnings": [*job.store.notes, *(finding.what for finding in findings), *warnings_of(frames)],

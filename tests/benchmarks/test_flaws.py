@@ -110,6 +110,23 @@ def test_rows_of_other_code_are_not_continued(tmp_path):
         benchmark.known_rows(argparse.Namespace(out=out))
 
 
+def test_errors_of_gains_are_those_over_the_rig_s():
+    """A factor that all cameras share is none; a stop too much in one of two is half a stop in each."""
+    injected = {"a": {"exposure_stops": 1.0, "white_balance": [0.25, 0.0]}}
+    balance = np.log([1.25, 1.0, 1.0]) - np.log(1.25) / 3.0
+    stops = 1.0 + np.log2(1.25) / 3.0
+    right = {"camera": "a", "stops": stops, "balance": balance, "gains": 4.0 * np.array([2.5, 2.0, 2.0])}
+    cameras = [right, {"camera": "b", "stops": 0.0, "balance": [0.0] * 3, "gains": [4.0] * 3}]
+    assert benchmark.gain_errors(injected, cameras) == pytest.approx(dict.fromkeys(NAMES, 0.0), abs=1e-12)
+    cameras[1]["stops"] = 1.0
+    found = benchmark.gain_errors(injected, cameras)
+    assert found["exposure_found"] == pytest.approx(0.5 * np.log(2.0))
+    assert found["white_balance_found"] == pytest.approx(0.0, abs=1e-12)
+
+
+NAMES = ("exposure_found", "white_balance_found", "exposure_error", "white_balance_error")
+
+
 def test_the_table_has_the_clean_capture_first_and_then_the_worst():
     def row(flaw, level, seed=0, **more):
         score = {"psnr": level, "ssim": 0.9}

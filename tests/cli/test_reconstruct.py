@@ -16,6 +16,7 @@ from beam_warp.cli.reconstruct import Modelling, frames_of, part_of, steps_of
 from beam_warp.cli.run import capture_at
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
 from beam_warp.image.files import write_exr
+from beam_warp.world.environment import EnvironmentMap
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def asked(monkeypatch):
     """What was asked of the steps; the fake does them."""
     found = []
 
-    def steps_of(modelling, capture, seed, device):
+    def steps_of(modelling, capture, seed, device, environment):
         found.append((modelling, seed, device))
         return FakeSteps(count=modelling.gaussians or 60, seed=seed)
 
@@ -150,12 +151,17 @@ class TestDetection:
 def test_the_words_reach_the_optimiser(folder):
     """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
     capture = Capture.read(folder)
-    steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), capture, seed=7, device="cpu")
+    steps = steps_of(
+        Modelling(gaussians=123, target_psnr=31.5, preset="paper"), capture, seed=7, device="cpu", environment=None
+    )
     asked = json.loads(json.dumps(steps.options()))["fitting"]
     assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
     assert steps.device == "cpu"
-    fast = steps_of(Modelling(gaussians=123, target_psnr=31.5), capture, seed=7, device="cpu")
+    fast = steps_of(
+        Modelling(gaussians=123, target_psnr=31.5), capture, 7, "cpu", EnvironmentMap.constant([1.0, 1.0, 1.0])
+    )
     assert steps.options() != fast.options()
+    assert steps.options()["environment"] != fast.options()["environment"]
 
 
 @pytest.mark.parametrize(

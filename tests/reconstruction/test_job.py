@@ -19,6 +19,7 @@ from support.leftovers import temporary_of_the_dead
 from beam_warp import read, validate
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera, read_corrections
+from beam_warp.capture.exposures import CameraExposure, RigExposures, read_exposures
 from beam_warp.capture.mask_corrections import MaskCorrections, read_mask_corrections
 from beam_warp.capture.mattes import MaskOffset
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
@@ -184,8 +185,8 @@ class TestOutputs:
 
         monkeypatch.setattr(CaptureRecord, "view", counted)
         reconstruct(capture, tmp_path / "out", FakeSteps())
-        # Once to inspect the capture, once for fit, tracking and previews, and the first frame for its cameras.
-        assert len(most) == 2 * 3 * len(FRAMES) + 3
+        # Once to inspect the capture, once for fit, tracking and previews, and the first for its cameras and exposures.
+        assert len(most) == 2 * 3 * len(FRAMES) + 2 * 3
         gc.collect()
         assert max(most) <= 2 * 3
         assert not alive
@@ -456,6 +457,32 @@ class TestCameras:
         ]
         reconstruct(Capture(**{**vars(capture), "records": tuple(moved)}), tmp_path / "out", steps, BEGINNING)
         assert steps.refined == []
+
+
+class TestExposures:
+    """Gains that are found hold for every frame, are kept beside the result, and are not sought twice."""
+
+    FOUND = RigExposures(
+        (CameraExposure("c0", 1.0, gains=(2.0, 2.0, 2.0)), CameraExposure("c1"), CameraExposure("c2")),
+        exposure_undone=True,
+    )
+
+    def test_frames_are_fitted_to_corrected_colours(self, capture, tmp_path):
+        steps = FakeSteps()
+        steps.exposures = self.FOUND
+        found = reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        for before, after in zip(capture.select(frames={1}), found.capture.select(frames={1}), strict=True):
+            factor = 2.0 if before.camera_name == "c0" else 1.0
+            np.testing.assert_array_equal(factor * after.view().color, before.view().color)
+        assert found.report["exposures"] == self.FOUND.as_dict()
+        assert "camera-exposure" in {finding["code"] for finding in found.report["findings"]}
+        assert read_exposures(tmp_path / "out") == self.FOUND
+        again = FakeSteps()  # would find nothing
+        assert reconstruct(capture, tmp_path / "out", again, BEGINNING).report["exposures"] == self.FOUND.as_dict()
+        assert again.calls == []
+        kept = reconstruct(capture, tmp_path / "out", steps, replace(BEGINNING, exposures="keep"))
+        assert kept.capture is capture
+        assert read_exposures(tmp_path / "out") is None
 
 
 def down_of(camera):

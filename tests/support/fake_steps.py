@@ -71,6 +71,7 @@ class FakeSteps:
     raster = RasterOptions(antialiased=True)
     rig = None
     masks = MaskCorrections()
+    exposures = None
 
     def __init__(self, count=60, seed=0):
         self.count, self.seed = count, seed
@@ -88,6 +89,10 @@ class FakeSteps:
         """What the test says, in ``rig``."""
         self.refined.append(tuple(names))
         return self.rig
+
+    def find_exposures(self, names, views, progress):
+        """What the test says, in ``exposures``."""
+        return self.exposures
 
     def begin(self, views, progress):
         level = self.level(views)

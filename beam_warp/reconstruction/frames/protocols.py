@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from beam_warp.capture.corrections import RigCorrection
+from beam_warp.capture.exposures import RigExposures
 from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
@@ -68,6 +69,12 @@ class FrameSteps(Protocol):
         self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
     ) -> RigCorrection | None:
         """Find what is wrong with the cameras that these names have and took these views; None for nothing to say."""
+        ...
+
+    def find_exposures(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> RigExposures | None:
+        """Find exposures and white balances of the cameras that took these views; None for nothing to say."""
         ...
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[FrameTrack, dict[str, Any]]:
