@@ -60,9 +60,13 @@ LEAST_PIXELS = 0.1
 
 NAMED: Mapping[str, Collection[str]] = {
     "exposure": ("camera-exposure",),
+    "noise": ("noisy-images",),
     "masks": ("mask-offset",),
     "light": ("environment-turned", "environment-exposure"),
     "clipping": ("clipped-images",),
+    "defocus": ("soft-images",),
+    "motion-blur": ("motion-blur",),
+    "jpeg": ("jpeg-loss",),
     "poses": ("camera-poses",),
     "wrong-camera": ("sees-nothing", "camera-contradicts"),
     "missing-image": ("missing-image",),
