@@ -16,6 +16,7 @@ Sources: slanted-edge measurement of sharpness (ISO 12233); Immerkær 1996 (nois
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,7 +200,7 @@ def _some(places: NDArray[np.int64]) -> NDArray[np.int64]:
     return places[np.linspace(0, len(places) - 1, min(len(places), MOST_PLACES)).astype(int)]
 
 
-def _windows(image: NDArray[np.generic], places: NDArray[np.int64], side: int) -> NDArray[np.generic]:
+def _windows(image: NDArray[Any], places: NDArray[np.int64], side: int) -> NDArray[Any]:
     """Return the squares of pixels around places, ``(K, side, side, C)``; the border's pixels go on beyond it."""
     ways = np.arange(side) - side // 2
     row, column = (np.clip(places[:, axis, None] + ways, 0, length - 1) for axis, length in enumerate(image.shape[:2]))

@@ -40,7 +40,7 @@ from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
-SURFACE_CHANNELS = 8
+SURFACE_CHANNELS = 11
 """Number of a pixel's channels that are added up over views."""
 
 LEAST_WEIGHT = 0.5
@@ -83,6 +83,8 @@ class ViewEvidence:
         colors: Scene-linear radiance towards each camera and its weight [pixel], ``(V, N)`` vec4; of no views if there
             were no images.
         directions: Unit, towards each camera, ``(V, N)`` vec3.
+        misfit: Mean square of what images differ by from what the Gaussians show, over the pixels with an image that
+            show each one, ``(N, 3)`` float32 on the host; 0 where there is none.
     """
 
     positions: wp.array
@@ -93,6 +95,7 @@ class ViewEvidence:
     saturated: NDArray[np.float32]
     colors: wp.array
     directions: wp.array
+    misfit: NDArray[np.float32]
 
 
 def view_evidence(
@@ -186,7 +189,9 @@ def view_evidence(
         target,
     )
     saturated = np.divide(cut, weight, out=np.zeros_like(cut), where=weight > 0.0)
-    return ViewEvidence(positions, normals, agreement, weight, seen, saturated, colors, directions)
+    with_image = colors.numpy()[..., 3].sum(axis=0)[:, None]
+    misfit = np.divide(totals[:, 8:], with_image, out=np.zeros_like(totals[:, 8:]), where=with_image > 0.0)
+    return ViewEvidence(positions, normals, agreement, weight, seen, saturated, colors, directions, misfit)
 
 
 def _groups(
