@@ -8,7 +8,8 @@ narrows them: what is stated is a lower bound, by up to a third too low.
 
 *Noise.* A second difference in rows and columns removes what varies smoothly. What is left of colour, red over its
 level less blue over its own, is not what a surface's texture mostly is, and the quartile of small squares with the
-least of it is noise; so is that of a texture without any even square.
+least of it is noise; so is that of a texture without any even square. Noise is taken to be that of photons, whose
+variance is in proportion to the value.
 
 Sources: slanted-edge measurement of sharpness (ISO 12233); Immerkær 1996 (noise by second differences).
 """
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, map_coordinates
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from beam_warp.capture.records import CaptureRecord
 from beam_warp.capture.views import CapturedView
@@ -29,6 +30,9 @@ from beam_warp.image.files import quantization_error
 
 SOLID = 0.5
 """The outline runs where coverage passes this value."""
+
+WHOLE = 0.999
+"""Coverage above which a pixel shows the subject alone."""
 
 MOST_PLACES = 4096
 """Places along an outline, and squares within it, that are looked at: evenly chosen."""
@@ -71,6 +75,9 @@ FREEDOM = (SQUARE - 2) ** 2 / (35.0 / 18.0) ** 2
 """Independent values among a square's differences: those of (1, -2, 1) correlate by -2/3 and 1/6 at one and two pixels,
 so that there are 1 + 2 (4/9 + 1/36) = 35/18 times fewer in each direction."""
 
+QUARTILE_OVER_MEAN = 2.0 * float(gammaincinv(0.5 * FREEDOM, QUARTILE)) / FREEDOM
+"""Quartile of a chi-squared variable of so many degrees over its mean."""
+
 DARK = 0.05
 """Squares below this part of the image's median level are left out: their noise is not the photons'."""
 
@@ -105,10 +112,10 @@ def quality_of(record: CaptureRecord, view: CapturedView) -> ImageQuality:
     loss = quantization_error(record.image_path)
     if view.alpha is None:
         solid = np.ones(view.color.shape[:2], bool)
-        return ImageQuality((np.nan, np.nan), noise_level(view.color, solid), loss, by_coverage=False)
+        return ImageQuality((np.nan, np.nan), _relative_noise(view.color, solid), loss, by_coverage=False)
     is_photograph = view.mask_offset is not None or record.mask_path is not None or record.plate_path is not None
     shown = record.image().linear_rgba()[..., :3] if is_photograph else view.alpha[..., None]
-    blur, noise = edge_blur(shown, view.alpha), noise_level(view.color, view.alpha > 0.999)
+    blur, noise = edge_blur(shown, view.alpha), _relative_noise(view.color, view.alpha > WHOLE)
     return ImageQuality(blur, noise, loss, by_coverage=not is_photograph)
 
 
@@ -172,15 +179,16 @@ def _outline(alpha: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[n
     return points[steep].astype(np.float64), slopes[steep] / lengths[steep, None]
 
 
-def noise_level(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
-    """Return the standard deviation of a colour channel over its value, in the middle of the subject's levels.
+def photon_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
+    """Return the variance of a pixel's colour channel over its value.
 
     Args:
         color: Scene-linear, ``(H, W, 3)``.
         solid: Which pixels show the subject alone, ``(H, W)``.
 
     Returns:
-        The deviation; NaN if no square of pixels shows the subject alone, or all are dark.
+        Variance over value, in the units of the colour; NaN if hardly a square of pixels shows the subject alone, or
+        all are dark.
     """
     places = _some(np.argwhere(solid))
     whole = _windows(solid[..., None], places, SQUARE).all(axis=(1, 2, 3))
@@ -191,8 +199,15 @@ def noise_level(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
         return np.nan
     relative = squares[lit] / level[lit, None, None]
     differences = convolve(relative[..., 0] - relative[..., 2], SECOND_DIFFERENCE[None])[:, 1:-1, 1:-1]
-    variance = np.square(differences).mean(axis=(1, 2)) / (chi2.ppf(QUARTILE, FREEDOM) / FREEDOM)
-    return float(np.sqrt(np.quantile(variance, QUARTILE) / 2.0))
+    inverse = 1.0 / level[lit, 0] + 1.0 / level[lit, 2]
+    variance = np.square(differences).mean(axis=(1, 2)) / inverse
+    return float(np.quantile(variance, QUARTILE) / QUARTILE_OVER_MEAN)
+
+
+def _relative_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
+    """Return the standard deviation of a channel over its value, in the middle of the subject's levels."""
+    level = float(np.median(color[solid])) if solid.any() else 0.0
+    return float(np.sqrt(photon_noise(color, solid) / level)) if level > 0.0 else np.nan
 
 
 def _some(places: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,8 +1,8 @@
 """Evidence that the pixels of views give on the Gaussians that they show: place, normal and colour of the surface.
 
 Pixels carry sums to be spread back over Gaussians by their blending weights: 0-2 place relative to an origin, 3-5
-normal, 6 weight of both; 7 weight of saturated pixels; 8-10 square of what follows; 11-13 captured colour less the
-rendered one, 14 its weight. 15 is not used: pixels are moved by four numbers at a time.
+normal, 6 weight of both; 7 weight of saturated pixels; 8-10 square of what follows, less what noise makes it; 11-13
+captured colour less the rendered one, 14 its weight. 15 is not used: pixels are moved by four numbers at a time.
 """
 
 import warp as wp
@@ -39,6 +39,7 @@ class CapturedPixels:
     color: wp.array[wp.vec3]  # scene-linear, premultiplied
     coverage: wp.array[float]
     ceiling: float  # value that the image cannot exceed
+    noise: float  # variance of a pixel over its value
 
 
 @wp.kernel
@@ -79,7 +80,7 @@ def write_pixels_kernel(
         rendered = wp.max(drawn.colors[pixel, c], 0.0)
         if drawn.display_srgb == 1:
             rendered = srgb_to_linear(wp.min(rendered, 1.0))
-        out_pixels[pixel, 8 + c] = (color[c] - rendered) * (color[c] - rendered)
+        out_pixels[pixel, 8 + c] = (color[c] - rendered) * (color[c] - rendered) - captured.noise * rendered
         out_pixels[pixel, 11 + c] = color[c] - rendered
     out_pixels[pixel, 14] = 1.0
 

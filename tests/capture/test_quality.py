@@ -10,7 +10,7 @@ from support.discs import SIDE, WALL, before, disc
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.inspect import inspect_capture
-from beam_warp.capture.quality import edge_blur, noise_level
+from beam_warp.capture.quality import edge_blur, photon_noise
 from beam_warp.image.files import quantization_error
 from beam_warp.stability.flaws.optics import defocused, motion_blurred
 from beam_warp.stability.flaws.write import write_flawed
@@ -53,17 +53,17 @@ def test_a_photograph_shows_its_blur_by_its_colors():
 
 def test_nothing_tells_without_an_outline():
     assert np.isnan(edge_blur(WALL, np.ones((SIDE, SIDE), np.float32))).all()
-    assert np.isnan(noise_level(WALL, np.zeros((SIDE, SIDE), bool)))
+    assert np.isnan(photon_noise(WALL, np.zeros((SIDE, SIDE), bool)))
 
 
-@pytest.mark.parametrize("noise", [0.01, 0.08])
+@pytest.mark.parametrize("noise", [1e-5, 4e-4, 2e-3])
 def test_noise_is_told_from_texture(noise):
     texture = gaussian_filter(RNG.normal(size=(SIDE, SIDE)), 0.7)[..., None] * np.array([0.1, 0.1, 0.1])
     surface = 0.5 * WALL * (1.0 + texture)
     solid = disc() == 1.0
-    assert noise_level(surface.astype(np.float32), solid) < 1e-3
-    noisy = surface * (1.0 + noise * RNG.normal(size=surface.shape))
-    assert noise_level(noisy.astype(np.float32), solid) == pytest.approx(noise, rel=0.15)
+    assert photon_noise(surface.astype(np.float32), solid) < 1e-6
+    noisy = RNG.poisson(surface / noise) * noise
+    assert photon_noise(noisy.astype(np.float32), solid) == pytest.approx(noise, rel=0.2)
 
 
 @pytest.mark.parametrize("quality", [75, 90, 95])
