@@ -34,7 +34,7 @@ SOLID = 0.5
 WHOLE = 0.999
 """Coverage above which a pixel shows the subject alone."""
 
-MOST_PLACES = 4096
+MOST_EDGES, MOST_SQUARES = 4096, 1024
 """Places along an outline, and squares within it, that are looked at: evenly chosen."""
 
 REACH = 3.0
@@ -166,7 +166,7 @@ def _outline(alpha: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[n
     """Return pixels along an outline, evenly chosen, and unit directions away from the subject, ``(K, 2)`` each."""
     inside = np.pad(alpha > SOLID, 1, mode="edge")
     enclosed = inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]
-    points = _some(np.argwhere(inside[1:-1, 1:-1] & ~enclosed))
+    points = _some(np.argwhere(inside[1:-1, 1:-1] & ~enclosed), MOST_EDGES)
     ways = np.arange(NORMAL_SIDE) - NORMAL_SIDE // 2
     bell = np.exp(-0.5 * (ways / NORMAL_BLUR) ** 2)
     windows = _windows(alpha[..., None], points, NORMAL_SIDE)[..., 0]
@@ -190,7 +190,7 @@ def photon_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
         Variance over value, in the units of the colour; NaN if hardly a square of pixels shows the subject alone, or
         all are dark.
     """
-    places = _some(np.argwhere(solid))
+    places = _some(np.argwhere(solid), MOST_SQUARES)
     whole = _windows(solid[..., None], places, SQUARE).all(axis=(1, 2, 3))
     squares = _windows(color, places[whole], SQUARE).astype(np.float64)
     level = squares.mean(axis=(1, 2))
@@ -210,9 +210,9 @@ def _relative_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> flo
     return float(np.sqrt(photon_noise(color, solid) / level)) if level > 0.0 else np.nan
 
 
-def _some(places: NDArray[np.int64]) -> NDArray[np.int64]:
+def _some(places: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     """Return places, evenly chosen from too many."""
-    return places[np.linspace(0, len(places) - 1, min(len(places), MOST_PLACES)).astype(int)]
+    return places[np.linspace(0, len(places) - 1, min(len(places), most)).astype(int)]
 
 
 def _windows(image: NDArray[Any], places: NDArray[np.int64], side: int) -> NDArray[Any]:
