@@ -69,7 +69,7 @@ SQUARE = 7
 """Side of the squares that noise is looked for in [pixel]; second differences are known in all but their border."""
 
 SECOND_DIFFERENCE = np.outer((1.0, -2.0, 1.0), (1.0, -2.0, 1.0)) / 6.0
-"""Of unit gain for noise that is independent from pixel to pixel."""
+"""Weights whose sum of squares is 1: noise that is independent from pixel to pixel keeps its deviation."""
 
 FREEDOM = (SQUARE - 2) ** 2 / (35.0 / 18.0) ** 2
 """Independent values among a square's differences: those of (1, -2, 1) correlate by -2/3 and 1/6 at one and two pixels,
