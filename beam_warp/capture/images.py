@@ -263,7 +263,10 @@ def _judge_quality(glimpses: Sequence[Glimpse], findings: Findings) -> None:
             soft[glimpse.record.name] = least
         elif glimpse.quality.by_coverage and largest > SOFT_PIXELS and least < STREAKED * largest:
             streaked[glimpse.record.name] = largest
+    noises = [glimpse.quality.noise for glimpse in glimpses if np.isfinite(glimpse.quality.noise)]
     noisy = {glimpse.record.name: glimpse.quality.noise for glimpse in glimpses if glimpse.quality.noise > NOISY}
+    if not 2 * len(noisy) > len(noises):
+        noisy = {}  # texture of some views
     lossy = {glimpse.record.name: glimpse.quality.loss for glimpse in glimpses if glimpse.quality.loss > LOSSY}
     for found, code, what, form, remedy in (
         (
