@@ -28,6 +28,7 @@ LARGEST = 1e6  # offset or weight: sums and squares of values stay finite in flo
 
 Float32 = NDArray[np.float32]
 Arrays = dict[str, Float32]
+Track = list["Component"]
 
 
 class DeliveryError(ValueError):
@@ -45,25 +46,19 @@ def _whole(value: Any, name: str, least: int, most: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """One array of a block: at frame f it is ``weights[f, :, 0] + weights[f, :, 1:] @ planes``.
+class Component:
+    """One component of an array of a block: at frame f it is ``weights[f, 0] + weights[f, 1:] @ planes``."""
 
-    Attributes:
-        weights: ``(F, C, 1 + S + P)``.
-        summed: The first planes, which all frames use, ``(S, N)``.
-        plain: The others, ``P`` of ``(N,)``; most have a weight in one frame only.
-    """
-
-    weights: Float32
-    summed: Float32
-    plain: list[NDArray[np.signedinteger]]
+    weights: Float32  # (F, 1 + S + P)
+    summed: Float32  # (S, N), the first planes, which all frames use
+    plain: list[NDArray[np.signedinteger]]  # the others, P of (N,); most have a weight in one frame only
 
     def at(self, frame: int) -> Float32:
-        """Return the values at a frame of the block, ``(C, N)``."""
-        offsets, first, last = np.split(self.weights[frame], [1, 1 + len(self.summed)], axis=1)
-        values = np.ascontiguousarray(first) @ self.summed + offsets
-        for component, plane in np.argwhere(last).tolist():
-            values[component] += self.plain[plane] * last[component, plane]
+        """Return the numbers at a frame of the block, ``(N,)``."""
+        offset, first, last = np.split(self.weights[frame], [1, 1 + len(self.summed)])
+        values = first @ self.summed + offset
+        for plane in np.flatnonzero(last):
+            values += self.plain[plane] * last[plane]
         return values
 
 
@@ -76,11 +71,7 @@ class Container:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Read the manifest and the static block.
-
-        Raises:
-            DeliveryError: They are malformed.
-        """
+        """Read the manifest and the static block; `DeliveryError` if they are malformed."""
         self._path = Path(path) / MANIFEST if Path(path).is_dir() else Path(path)
         self._is_archive, self._start = self._path.suffix != ".json", 0
         content = self._manifest()
@@ -92,7 +83,7 @@ class Container:
         _check(self.manifest)
         tracks = self.tracks(self.manifest["static"], 1)
         _require(tracks.keys() >= REQUIRED, f"the static block must hold {', '.join(sorted(REQUIRED))}", sorted(tracks))
-        self._raw = {name: track.at(0) for name, track in tracks.items()}
+        self._raw = {name: np.stack([each.at(0) for each in track]) for name, track in tracks.items()}
         self.still: Arrays = {name: activated(name, values) for name, values in self._raw.items()}
         self._unpacked = -1, dict[str, Track]()
 
@@ -112,11 +103,7 @@ class Container:
         return content
 
     def tracks(self, entry: dict[str, Any], frames: int) -> dict[str, Track]:
-        """Read, check and unpack a block: one range of the file.
-
-        Raises:
-            DeliveryError: It is cut short, was altered, or is malformed.
-        """
+        """Read, check and unpack a block, one range of the file; `DeliveryError` if it was altered or is malformed."""
         name, size = entry["file"], entry["unpacked"]
         path = self._path if self._is_archive else self._path.with_name(name)
         _require(path.is_file(), "a container must hold all its files", f"no {name}")
@@ -144,7 +131,8 @@ class Container:
         if unpacked != index:
             tracks = self.tracks(segments[index], segments[index]["frames"])
             self._unpacked = index, tracks
-        raw = {name: track.at(number - segments[index]["first"]) for name, track in tracks.items()}
+        at = number - segments[index]["first"]
+        raw = {name: np.stack([each.at(at) for each in track]) for name, track in tracks.items()}
         for name in raw.keys() & self._raw.keys():
             raw[name] += self._raw[name]
         turn = quaternions(raw.pop("turns")) if "turns" in raw else None
@@ -183,21 +171,27 @@ def _tracks(content: bytes, frames: int, count: int) -> dict[str, Track]:
     at = 4 + struct.unpack_from("<I", content)[0]
     arrays, weights, found = json.loads(content[4:at])["arrays"], [], {}
     for array in arrays:
-        name, sizes = array["name"], (*array["summed"], *array["plain"])
-        _require(name in COMPONENTS and all(type(size) is int and 1 <= size <= 4 for size in sizes), "arrays", array)
-        shape = frames, COMPONENTS[name], 1 + len(sizes)
-        weights.append(np.frombuffer(content, "<f4", shape[0] * shape[1] * shape[2], at).reshape(shape))
-        _require((np.abs(weights[-1]) <= LARGEST).all(), f"weights must be at most {LARGEST:g}", name)
-        at += weights[-1].nbytes
-    for array, numbers in zip(arrays, weights, strict=True):
-        planes = []
-        for size in (*array["summed"], *array["plain"]):
-            planes.append(_plane(content, at, count, size))
-            at += size * count
-        summed = np.empty((len(array["summed"]), count), np.float32)
-        for plane, row in zip(planes, summed, strict=False):
-            row[:] = np.cumsum(plane, dtype=np.int32)
-        found[array["name"]] = Track(numbers, summed, planes[len(summed) :])
+        name, planes = array["name"], array["planes"]
+        _require(name in COMPONENTS and len(planes) == COMPONENTS[name], "arrays must be known", name)
+        for summed, plain in planes:
+            _require(
+                all(type(n) is int and 1 <= n <= 4 for n in (*summed, *plain)), "planes must have 1 to 4 bytes", name
+            )
+            columns = 1 + len(summed) + len(plain)
+            weights.append(np.frombuffer(content, "<f4", frames * columns, at).reshape(frames, columns))
+            _require((np.abs(weights[-1]) <= LARGEST).all(), f"weights must be at most {LARGEST:g}", name)
+            at += weights[-1].nbytes
+    for array in arrays:
+        found[array["name"]] = track = []
+        for widths in array["planes"]:
+            planes = []
+            for size in (*widths[0], *widths[1]):
+                planes.append(_plane(content, at, count, size))
+                at += size * count
+            summed = np.empty((len(widths[0]), count), np.float32)
+            for plane, row in zip(planes, summed, strict=False):
+                row[:] = np.cumsum(plane, dtype=np.int32)
+            track.append(Component(weights.pop(0), summed, planes[len(summed) :]))
     return found
 
 

@@ -22,15 +22,7 @@ from beam_warp._version import __version__
 from beam_warp.converters.common.activations import log_scale
 from beam_warp.converters.common.colors import resize_bands
 from beam_warp.converters.common.options import WriteOptions
-from beam_warp.converters.delivery.decoder import (
-    FREE_BYTES,
-    MANIFEST,
-    MAX_RATIO,
-    MAX_SEGMENT_FRAMES,
-    product,
-    quaternions,
-    rotated,
-)
+from beam_warp.converters.delivery.decoder import FREE_BYTES, MANIFEST, MAX_RATIO, product, quaternions, rotated
 from beam_warp.converters.delivery.motion import SLACK, Planes, differences, moving, still, stored, width
 from beam_warp.errors import InvalidArrayError
 from beam_warp.outputs import replacing
@@ -41,8 +33,8 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 AXES = "rub"
 """Axes of every container: y up, right-handed, as in glTF and three.js."""
 
-SEGMENT_VALUES = 2**22
-"""Gaussians times frames of a segment at most, unless a frame has more: what a player unpacks at once."""
+SEGMENT_FRAMES = 12
+"""Frames of a segment: longer ones take a little less space, but their motion takes more planes at every frame."""
 
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every entry, so that the same Gaussians give the same bytes."""
@@ -98,10 +90,9 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
     with TemporaryFile() as spool, ExitStack() as outputs:
         blocks = _Blocks(spool)
         static = blocks.add("static.bin", 1, take.static_planes())
-        length = min(MAX_SEGMENT_FRAMES, max(1, SEGMENT_VALUES // max(1, len(first))))
         segments = []
-        for start in range(0, len(sequence), length):
-            frames = range(start, min(start + length, len(sequence)))
+        for start in range(0, len(sequence), SEGMENT_FRAMES):
+            frames = range(start, min(start + SEGMENT_FRAMES, len(sequence)))
             entry = blocks.add(f"{start:06d}.bin", len(frames), take.segment_planes(frames))
             segments.append({"first": start, "frames": len(frames), **entry})
         manifest = _manifest(sequence, first, bounds, take.names) | {"static": static, "segments": segments}
@@ -172,8 +163,8 @@ class _Take:
     def __post_init__(self) -> None:
         """Settle what the static block says, as a decoder reads it."""
         raw = self.first | {"orientations": _rodrigues(self.first["orientations"][None])[0]}
-        self._planes = {name: still(values, self._allowed(name)) for name, values in raw.items()}
-        self._static = {name: planes.values()[0] for name, planes in self._planes.items()}
+        self._planes = {name: [still(row, self._allowed(name)) for row in values] for name, values in raw.items()}
+        self._static = {name: _values(planes)[0] for name, planes in self._planes.items()}
         self._turned_from = quaternions(self._static["orientations"])
 
     @property
@@ -184,21 +175,21 @@ class _Take:
     def _allowed(self, name: str) -> float:
         return _allowed(name, self.bounds[name.partition("_")[0] if name.startswith("radiance") else name])
 
-    def static_planes(self) -> Mapping[str, Planes]:
+    def static_planes(self) -> Mapping[str, list[Planes]]:
         """Return the arrays of the static block: those of the first frame."""
         return self._planes
 
-    def segment_planes(self, frames: range) -> Mapping[str, Planes]:
+    def segment_planes(self, frames: range) -> Mapping[str, list[Planes]]:
         """Return what some frames add to the static block: the arrays that differ from it by more than the bound."""
         raw = [self._checked(frame) for frame in frames]
-        found = dict[str, Planes]()
+        found = dict[str, list[Planes]]()
 
         def add(name: str, values: NDArray[np.float32]) -> NDArray[np.float32] | None:
             """Keep an array ``(F, C, N)`` if it is needed, and return what a decoder makes of it."""
             if not np.abs(values).max(initial=0.0) > SLACK * self._allowed(name):
                 return None
-            found[name] = moving(values, self._allowed(name))
-            return found[name].values()
+            found[name] = [moving(component, self._allowed(name)) for component in values.swapaxes(0, 1)]
+            return _values(found[name])
 
         turns = add("turns", _turns(np.stack([each.pop("orientations") for each in raw]), self._turned_from))
         if "normals" in raw[0]:
@@ -253,6 +244,11 @@ def _turns(orientations: NDArray[np.float32], start: NDArray[np.float32]) -> NDA
     return _rodrigues(np.stack([product(each, back) for each in orientations]))
 
 
+def _values(components: Sequence[Planes]) -> NDArray[np.float32]:
+    """Return what a decoder makes of the components of an array, ``(F, C, N)``."""
+    return np.stack([each.values() for each in components], axis=1)
+
+
 class _Blocks:
     """Packed blocks, kept in a temporary file until the manifest in front of them is known.
 
@@ -264,7 +260,7 @@ class _Blocks:
         self.sizes: dict[str, int] = {}
         self._spool, self._end = spool, 0
 
-    def add(self, name: str, frames: int, arrays: Mapping[str, Planes]) -> dict[str, Any]:
+    def add(self, name: str, frames: int, arrays: Mapping[str, list[Planes]]) -> dict[str, Any]:
         """Pack a block and return its entry in the manifest."""
         content = block_bytes(frames, arrays)
         packed = zlib.compress(content, 9)
@@ -283,20 +279,18 @@ class _Blocks:
         yield from (self._spool.read(size) for size in self.sizes.values())
 
 
-def block_bytes(frames: int, arrays: Mapping[str, Planes]) -> bytes:
+def block_bytes(frames: int, arrays: Mapping[str, list[Planes]]) -> bytes:
     """Return a block: the length of its header, the header, the weights of all arrays, and their planes."""
     described, weights, planes = [], [], []
-    for name, array in arrays.items():
-        assert len(array.weights) == frames
-        coded = [[differences(plane) for plane in array.summed], list(array.plain)]
-        widths = [[width(plane) for plane in group] for group in coded]
-        described.append({"name": name, "summed": widths[0], "plain": widths[1]})
-        weights.append(array.weights.astype("<f4").tobytes())
-        planes += [
-            stored(plane, size)
-            for group, sizes in zip(coded, widths, strict=True)
-            for plane, size in zip(group, sizes, strict=True)
-        ]
+    for name, components in arrays.items():
+        widths = []
+        for each in components:
+            assert len(each.weights) == frames
+            groups = [[differences(plane) for plane in each.summed], list(each.plain)]
+            widths.append([[width(plane) for plane in group] for group in groups])
+            weights.append(each.weights.astype("<f4").tobytes())
+            planes += [stored(plane) for group in groups for plane in group]
+        described.append({"name": name, "planes": widths})
     header = json.dumps({"arrays": described}, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 4)
     return b"".join([struct.pack("<I", len(header)), header, *weights, *planes])
