@@ -23,7 +23,7 @@ from beam_warp.converters.common.activations import log_scale
 from beam_warp.converters.common.colors import resize_bands
 from beam_warp.converters.common.options import WriteOptions
 from beam_warp.converters.delivery.decoder import FREE_BYTES, MANIFEST, MAX_RATIO, product, quaternions, rotated
-from beam_warp.converters.delivery.motion import SLACK, Planes, differences, moving, still, stored, width
+from beam_warp.converters.delivery.motion import Planes, differences, moving, still, stored, width
 from beam_warp.errors import InvalidArrayError
 from beam_warp.outputs import replacing
 from beam_warp.world.axes import change_axes
@@ -117,29 +117,30 @@ def _order(positions: NDArray[np.float32]) -> NDArray[np.intp]:
     return morton_order(((positions - low) * (65535.0 / extent)).astype(np.uint32))
 
 
-def _raw(cloud: GaussianCloud, options: WriteOptions) -> Arrays:
-    """Return what is stored of a frame as numbers that add up, planar ``(C, N)``; orientations as quaternions.
+def delivered(cloud: GaussianCloud, options: WriteOptions) -> tuple[str, ...]:
+    """Return the arrays of a cloud that a container holds: what is drawn.
 
     Radiance is left out of an asset that can be relit, unless its degree is asked for.
     """
-    found: Arrays = {
-        "positions": cloud.positions.T,
-        "orientations": cloud.orientations.T / np.linalg.norm(cloud.orientations, axis=1),
-        "scales": log_scale(cloud.scales).T,
-        "opacities": cloud.opacities[None],
-    }
-    if cloud.base_color is not None:
-        found["base_color"] = cloud.base_color.T
-    if cloud.roughness is not None:
-        found["roughness"] = cloud.roughness[None]
-    if cloud.ambient_occlusion is not None:
-        found["ambient_occlusion"] = cloud.ambient_occlusion[None]
-    if cloud.normals is not None:
-        found["normals"] = cloud.normals.T / np.linalg.norm(cloud.normals, axis=1)
-    if cloud.radiance is not None and (options.sh_degree is not None or not cloud.is_relightable):
-        radiance = resize_bands(cloud.radiance, options.sh_degree)
-        found |= {f"radiance_{k}": radiance[:, k].T for k in range(radiance.shape[1])}
-    return {name: np.ascontiguousarray(values, np.float32) for name, values in found.items()}
+    shows_radiance = options.sh_degree is not None or not cloud.is_relightable
+    wanted = {*_ROWS, "orientations", *(["radiance"] if shows_radiance else [])}
+    return tuple(name for name in cloud.arrays() if name in wanted)
+
+
+_ROWS = ("positions", "scales", "opacities", "base_color", "roughness", "ambient_occlusion", "normals")
+
+
+def _raw(cloud: GaussianCloud, options: WriteOptions) -> Arrays:
+    """Return what is stored of a frame as numbers that add up, planar ``(C, N)``; orientations as quaternions."""
+    arrays = {name: getattr(cloud, name) for name in delivered(cloud, options)}
+    for name in arrays.keys() & {"orientations", "normals"}:
+        arrays[name] = arrays[name] / np.linalg.norm(arrays[name], axis=1, keepdims=True)
+    arrays["scales"] = log_scale(cloud.scales)
+    if (radiance := arrays.pop("radiance", None)) is not None:
+        bands = resize_bands(radiance, options.sh_degree)
+        arrays |= {f"radiance_{k}": bands[:, k] for k in range(bands.shape[1])}
+    planar = {name: values[None] if values.ndim == 1 else values.T for name, values in arrays.items()}
+    return {name: np.ascontiguousarray(values, np.float32) for name, values in planar.items()}
 
 
 @dataclass
@@ -186,7 +187,7 @@ class _Take:
 
         def add(name: str, values: NDArray[np.float32]) -> NDArray[np.float32] | None:
             """Keep an array ``(F, C, N)`` if it is needed, and return what a decoder makes of it."""
-            if not np.abs(values).max(initial=0.0) > SLACK * self._allowed(name):
+            if not np.abs(values).max(initial=0.0) > self._allowed(name):
                 return None
             found[name] = [moving(component, self._allowed(name)) for component in values.swapaxes(0, 1)]
             return _values(found[name])
