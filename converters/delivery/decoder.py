@@ -21,8 +21,7 @@ COMPONENTS = dict.fromkeys(("opacities", "roughness", "ambient_occlusion"), 1)
 COMPONENTS |= dict.fromkeys(("positions", "orientations", "turns", "scales", "base_color", "normals"), 3)
 COMPONENTS |= {f"radiance_{k}": 3 for k in range(25)}
 REQUIRED = {"positions", "orientations", "scales", "opacities"}
-MAX_SEGMENT_FRAMES = 30
-FREE_BYTES, MAX_RATIO = 2**24, 64  # a block of b bytes unpacks to FREE_BYTES + MAX_RATIO b at most
+MAX_FRAMES, FREE_BYTES, MAX_RATIO = 30, 2**24, 64  # of a segment; b bytes unpack to FREE_BYTES + MAX_RATIO b
 FREE_COUNT = 2**18  # Gaussians; more need a byte each in the static block
 LARGEST = 1e6  # offset or weight: sums and squares of values stay finite in float32
 
@@ -162,7 +161,7 @@ def _check(said: dict[str, Any]) -> None:
     _whole(said.get("count"), "count", 0, FREE_COUNT + static["bytes"])
     for entry in segments:
         _whole(entry.get("first"), f"first of {entry['file']}", following, following)
-        following += _whole(entry.get("frames"), f"frames of {entry['file']}", 1, MAX_SEGMENT_FRAMES)
+        following += _whole(entry.get("frames"), f"frames of {entry['file']}", 1, MAX_FRAMES)
     _whole(said.get("frames"), "frames", max(following, 1), following)
 
 
@@ -192,6 +191,7 @@ def _tracks(content: bytes, frames: int, count: int) -> dict[str, Track]:
             for plane, row in zip(planes, summed, strict=False):
                 row[:] = np.cumsum(plane, dtype=np.int32)
             track.append(Component(weights.pop(0), summed, planes[len(summed) :]))
+    _require(at == len(content), f"planes must fill {len(content)} bytes", at)
     return found
 
 

@@ -174,6 +174,7 @@ function split(content, file, frames, count) {
         return plane(content.subarray(at, at += size * count), count, size, k < component.first);
       });
     }
+    require(at === content.length, `${file} must be filled by its planes`, at);
   } catch (error) {
     throw error instanceof DeliveryError ? error : new DeliveryError(`${file} must be a sound block, got ${error.message}.`);
   }
