@@ -54,7 +54,7 @@ from beam_warp.world.mesh import MaterialMesh
 Row = dict[str, Any]
 
 RASTER = RasterOptions(antialiased=True)
-TRUTH_PATHS = 64
+TRUTH_PATHS = 32
 LIGHTS = ("studio", "sunset")
 SCRIPT = Path(__file__).with_name("decode_delivery.mjs")
 
@@ -251,9 +251,9 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=9, metavar="N")
     record.add_arguments(parser)
     arguments = parser.parse_args()
-    settings = [(2_000, (1.0,))] if arguments.quick else [(30_000, (1.0, 2.0, 4.0)), (140_000, (1.0, 2.0))]
+    settings = [(2_000, (1.0,))] if arguments.quick else [(30_000, (1.0, 2.0, 4.0)), (140_000, (1.0,))]
     with tempfile.TemporaryDirectory(prefix="beam_delivery_") as folder:
-        frames, height = (4, 60) if arguments.quick else (24, 300)
+        frames, height = (4, 60) if arguments.quick else (24, 200)
         bench = Bench(settings, frames, height, arguments.repeats, Path(folder))
         keep = functools.partial(record.write_result, arguments, resolve_device(None))
         result = parts.measure(PARTS, bench, only=arguments.parts, keep=keep)

@@ -23,7 +23,7 @@ DANCE_SECONDS = 1.5
 
 OPACITY = 0.95
 
-AO_GAUSSIANS, AO_RAYS = 12_000, 32
+AO_GAUSSIANS, AO_RAYS = 8_000, 16
 """Gaussians at which occlusion is traced, and rays of each."""
 
 RAYS = 64
