@@ -69,9 +69,15 @@ def bounds_of(cloud: GaussianCloud, factor: float = 1.0) -> dict[str, float]:
 
 
 def _allowed(name: str, bound: float) -> float:
-    """Return how far a stored number may be off for the bound of its array: a turn by a in radians moves modified
-    Rodrigues parameters by a / 4 or more, and a unit vector turns by at most the arc sine of what is added to it."""
-    if name in ("turns", "orientations"):
+    """Return how far each stored number of an array may be off, so that the array keeps to its bound.
+
+    Modified Rodrigues parameters move by a quarter of an angle [rad] at most, and a unit vector turns by at most the
+    arc sine of what is added to it. Orientations of the static block have a third: the turns back to what they were
+    before rounding, whose components may be longer than those of the rounding, are then small enough to be left out.
+    """
+    if name == "orientations":
+        return bound / 12.0
+    if name == "turns":
         return bound / (4.0 * np.sqrt(3.0))
     return float(np.sin(min(bound, 1.5)) / np.sqrt(3.0)) if name == "normals" else bound
 
