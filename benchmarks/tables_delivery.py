@@ -14,7 +14,7 @@ def takes(result: Row) -> Rows:
     """Return the containers of a take: size, errors root mean square, relit loss, and time to decode a frame."""
     head = ["Gaussians", "error scale", "KB a frame", "moving", "position [mm]", "orientation", "normal"]
     rows: list[list[Any]] = [
-        [*head, "occlusion", "relit loss [dB]", "NumPy [ms]", "Node.js [ms]", "written [s a frame]"]
+        [*head, "occlusion", "relit [dB]", "loss [dB]", "NumPy [ms]", "Node.js [ms]", "written [s a frame]"]
     ]
     for row in result["takes"]["rows"]:
         errors = row["errors"]
@@ -28,6 +28,7 @@ def takes(result: Row) -> Rows:
                 f"{cell(errors['turn_degrees']['rms'], '.2f')}°",
                 f"{cell(errors['normal_degrees']['rms'], '.2f')}°",
                 cell(errors["occlusion"]["rms"], ".3f"),
+                cell(min(row["relit_psnr"].values()), ".1f"),
                 cell(row["relit_loss_db"], ".2f"),
                 cell(row["numpy_ms"]["all"], ".1f"),
                 cell(row["node_ms"] and row["node_ms"]["all"], ".1f"),

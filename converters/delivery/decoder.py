@@ -143,7 +143,7 @@ class Container:
         return arrays
 
 
-def _check(said: dict[str, Any]) -> None:
+def _check(said: Any) -> None:
     """Refuse a manifest whose numbers and names cannot be right."""
     _require((said.get("format"), said.get("version")) == ("b4d", 1), "version must be 1 of b4d", said.get("version"))
     _require(

@@ -242,7 +242,7 @@ def _rodrigues(quaternions: NDArray[np.float32]) -> NDArray[np.float32]:
     ):
         found[frame] *= np.where(np.einsum("cn,cn->n", found[frame], found[before]) < 0.0, -1.0, 1.0)
     found *= np.where(found[:, 3:] < -0.8, -1.0, 1.0)
-    return found[:, :3] / (1.0 + found[:, 3:])
+    return (found[:, :3] / (1.0 + found[:, 3:])).astype(np.float32)
 
 
 def _turns(orientations: NDArray[np.float32], start: NDArray[np.float32]) -> NDArray[np.float32]:

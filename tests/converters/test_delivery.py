@@ -248,7 +248,7 @@ class TestDecoders:
         assert done.stdout.startswith("true 000012.bin must have the digest"), done
 
     def test_the_decoder_stands_alone(self):
-        """It imports NumPy and the standard library, and has at most 200 lines that are not blank."""
+        """The decoder imports NumPy and the standard library, and has at most 200 lines that are not blank."""
         text = Path(decoder.__file__).read_text(encoding="utf-8")
         imports = [n for n in ast.walk(ast.parse(text)) if isinstance(n, (ast.Import, ast.ImportFrom))]
         names = {a.name for n in imports if isinstance(n, ast.Import) for a in n.names}
