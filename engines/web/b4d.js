@@ -6,14 +6,11 @@
  *     const frame = await take.frame(12);  // {positions: Float32Array(3 N), orientations: Float32Array(4 N), ...}
  */
 
-const MANIFEST = "manifest.json";
-const HEAD_BYTES = 65536;
+const MANIFEST = "manifest.json", HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26;
 const FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30, LARGEST = 1e6;
-const COMPONENTS = {
-  positions: 3, orientations: 3, turns: 3, scales: 3, base_color: 3, normals: 3,
-  opacities: 1, roughness: 1, ambient_occlusion: 1,
-  ...Object.fromEntries(Array.from({length: 25}, (_, k) => [`radiance_${k}`, 3])),
-};
+const COMPONENTS = {positions: 3, orientations: 3, turns: 3, scales: 3, opacities: 1, base_color: 3, roughness: 1};
+Object.assign(COMPONENTS, {ambient_occlusion: 1, normals: 3});
+for (let k = 0; k < 25; k++) COMPONENTS[`radiance_${k}`] = 3;
 
 /** A container breaks its format; the message names the file in it. */
 export class DeliveryError extends Error {}
@@ -30,9 +27,8 @@ function whole(value, name, least, most) {
 /** Reads ranges of a file at a URL; a server without ranges sends the whole file, of which the range is taken. */
 function rangesOf(url) {
   return async (name, start, size) => {
-    const answer = await fetch(name === null ? url : new URL(name, new URL(url, globalThis.location?.href)), {
-      headers: {Range: `bytes=${start}-${start + size - 1}`},
-    });
+    const place = name === null ? url : new URL(name, new URL(url, globalThis.location?.href));
+    const answer = await fetch(place, {headers: {Range: `bytes=${start}-${start + size - 1}`}});
     require(answer.ok, `${name ?? url} must be within reach`, answer.status);
     const content = new Uint8Array(await answer.arrayBuffer());
     return answer.status === 206 ? content : content.subarray(start, start + size);
@@ -48,10 +44,7 @@ export class Take {
    *     (name null) or of a file beside the manifest; by default with fetch.
    */
   static async open(url, read = rangesOf(url)) {
-    const take = new Take();
-    take.read = read;
-    take.isArchive = !url.endsWith(".json");
-    take.start = 0;
+    const take = Object.assign(new Take(), {read, isArchive: !url.endsWith(".json"), start: 0});
     let content = await read(null, 0, HEAD_BYTES);
     if (take.isArchive) {
       const head = new DataView(content.buffer, content.byteOffset, content.byteLength);
@@ -62,7 +55,7 @@ export class Take {
       if (take.start > content.length) content = await read(null, 0, take.start);
       content = content.subarray(at, take.start);
     } else if (content.length === HEAD_BYTES) {
-      content = await read(null, 0, 2 ** 26);
+      content = await read(null, 0, MAX_MANIFEST_BYTES);
     }
     try {
       take.manifest = JSON.parse(new TextDecoder().decode(content));
@@ -71,9 +64,8 @@ export class Take {
     }
     check(take.manifest);
     const tracks = await take.tracks(take.manifest.static, 1);
-    for (const name of ["positions", "orientations", "scales", "opacities"]) {
-      require(name in tracks, "the static block must hold positions, orientations, scales and opacities", name);
-    }
+    const missing = ["positions", "orientations", "scales", "opacities"].filter((name) => !(name in tracks));
+    require(!missing.length, "the static block must hold positions, orientations, scales and opacities", missing);
     take.raw = mapped(tracks, (track) => valuesAt(track, 0, take.manifest.count, null));
     take.still = mapped(take.raw, (values, name) => activated(name, values.slice()));
     return take;
@@ -81,43 +73,31 @@ export class Take {
 
   /** Return the arrays of a block, after one request; `entry` is `manifest.static` or one of `manifest.segments`. */
   async tracks(entry, frames) {
-    const packed = await (this.isArchive
-      ? this.read(null, this.start + entry.offset, entry.bytes)
-      : this.read(entry.file, 0, entry.bytes));
+    const [name, start] = this.isArchive ? [null, this.start + entry.offset] : [entry.file, 0];
+    const packed = await this.read(name, start, entry.bytes);
     require(packed.length === entry.bytes, `${entry.file} must have ${entry.bytes} bytes`, packed.length);
     if (globalThis.crypto?.subtle) { // pages from http have none
-      const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", packed));
-      const digits = Array.from(digest, (byte) => byte.toString(16).padStart(2, "0")).join("");
+      const digest = await crypto.subtle.digest("SHA-256", packed);
+      const digits = Array.from(new Uint8Array(digest), (byte) => byte.toString(16).padStart(2, "0")).join("");
       require(digits === entry.sha256, `${entry.file} must have the digest that ${MANIFEST} says`, digits);
     }
     return split(await inflated(packed, entry), entry.file, frames, this.manifest.count);
   }
 
-  /** Return the number of the segment that holds a frame. */
-  segmentOf(frame) {
-    return this.manifest.segments.findIndex((entry) => frame < entry.first + entry.frames);
-  }
-
   /** Return a frame; its segment is fetched and unpacked if it is not the one of the last call. */
   async frame(number) {
-    const index = this.segmentOf(whole(number, "frame", 0, this.manifest.frames - 1));
-    if (this.unpacked?.index !== index) {
-      const entry = this.manifest.segments[index];
-      this.unpacked = {index, tracks: await this.tracks(entry, entry.frames)};
-    }
-    return this.frameOf(this.unpacked.tracks, number - this.manifest.segments[index].first);
+    whole(number, "frame", 0, this.manifest.frames - 1);
+    const entry = this.manifest.segments.find(({first, frames}) => number < first + frames);
+    if (this.unpacked?.entry !== entry) this.unpacked = {entry, tracks: await this.tracks(entry, entry.frames)};
+    return this.frameOf(this.unpacked.tracks, number - entry.first);
   }
 
   /** Return a frame of a segment whose tracks are at hand; arrays that do not change are shared between frames. */
   frameOf(tracks, frame) {
     const count = this.manifest.count, found = {...this.still};
-    let turns = null;
-    for (const [name, track] of Object.entries(tracks)) {
-      const values = valuesAt(track, frame, count, this.raw[name]);
-      if (name === "turns") turns = values;
-      else found[name] = activated(name, values);
-    }
-    if (turns) turn(found, turns, count);
+    const values = mapped(tracks, (track, name) => valuesAt(track, frame, count, this.raw[name]));
+    for (const name of Object.keys(values)) if (name !== "turns") found[name] = activated(name, values[name]);
+    if (values.turns) turn(found, values.turns, count);
     return found;
   }
 }
@@ -134,9 +114,8 @@ function check(said) {
   }
   whole(said.count, "count", 0, FREE_COUNT + said.static.bytes);
   let following = 0;
-  for (const entry of said.segments) {
-    whole(entry.first, "first", following, following);
-    following += whole(entry.frames, "frames", 1, MAX_FRAMES);
+  for (const {first, frames} of said.segments) {
+    following = whole(first, "first", following, following) + whole(frames, "frames", 1, MAX_FRAMES);
   }
   whole(said.frames, "frames", Math.max(following, 1), following);
 }
@@ -185,8 +164,7 @@ function split(content, file, frames, count) {
 function plane(octets, count, size, isSummed) {
   require(size >= 1 && size <= 4, "planes must have 1 to 4 bytes", size);
   const numbers = isSummed || size > 1 ? new Float32Array(count) : new Int8Array(count);
-  let sum = 0;
-  for (let i = 0; i < count; i++) {
+  for (let i = 0, sum = 0; i < count; i++) {
     let code = octets[i];
     for (let order = 1; order < size; order++) code |= octets[order * count + i] << (8 * order);
     const number = (code >>> 1) ^ -(code & 1);
@@ -201,7 +179,7 @@ function valuesAt(track, frame, count, start) {
   track.forEach(({columns, weights, planes, first}, c) => {
     const out = values.subarray(c * count, (c + 1) * count), at = frame * columns;
     let from = start ? start.subarray(c * count, (c + 1) * count) : out;
-    for (let k = 0; k < first || k === 0; k += 4, from = out) {
+    for (let k = 0; k < Math.max(first, 1); k += 4, from = out) {
       const [a, b, d, e] = [0, 1, 2, 3].map((j) => (k + j < first ? planes[k + j] : out));
       const [p, q, r, s] = [0, 1, 2, 3].map((j) => (k + j < first ? weights[at + 1 + k + j] : 0));
       blend(out, from, k ? 0 : weights[at], a, b, d, e, p, q, r, s);

@@ -247,6 +247,11 @@ class TestDecoders:
         done = subprocess.run([NODE, script], capture_output=True, text=True)
         assert done.stdout.startswith("true 000012.bin must have the digest"), done
 
+    def test_the_reader_in_javascript_is_short(self):
+        lines = (ROOT / "engines/web/b4d.js").read_text(encoding="utf-8").splitlines()
+        assert sum(not re.match(r"\s*($|//|/\*|\*)", line) for line in lines) <= 200
+        assert not any(re.match("import|require", line) for line in lines)
+
     def test_the_decoder_stands_alone(self):
         """The decoder imports NumPy and the standard library, and has at most 200 lines that are not blank."""
         text = Path(decoder.__file__).read_text(encoding="utf-8")
