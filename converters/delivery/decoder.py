@@ -154,7 +154,7 @@ def _check(said: Any) -> None:
     for entry in (static, *segments):
         name = entry.get("file") if isinstance(entry, dict) else entry
         is_name = isinstance(name, str) and 0 < len(name) < 256 and name.isprintable() and not set(name) & set("/\\:")
-        _require(is_name and name.strip("."), "blocks must say their file, a name beside the manifest", name)
+        _require(is_name and name.strip("."), "blocks must say their file, a name beside the manifest", name)  # type: ignore
         _whole(entry.get("offset"), f"offset of {name}", 0, 2**53)
         size = _whole(entry.get("bytes"), f"bytes of {name}", 1, 2**40)
         _whole(entry.get("unpacked"), f"unpacked of {name}", 4, min(FREE_BYTES + MAX_RATIO * size, 2**31))
