@@ -175,26 +175,22 @@ function plane(octets, count, size, isSummed) {
 
 /** Return offset plus weights times planes for each component, plus what the static block says. */
 function valuesAt(track, frame, count, start) {
-  const values = new Float32Array(track.length * count);
+  const values = new Float32Array(track.length * count), none = new Int8Array(count);
   track.forEach(({columns, weights, planes, first}, c) => {
-    const out = values.subarray(c * count, (c + 1) * count), at = frame * columns;
+    const out = values.subarray(c * count, (c + 1) * count), row = weights.subarray(frame * columns, (frame + 1) * columns);
+    const plain = planes.map((_, k) => k).filter((k) => k >= first && row[1 + k]);
     let from = start ? start.subarray(c * count, (c + 1) * count) : out;
-    for (let k = 0; k < Math.max(first, 1); k += 4, from = out) {
-      const [a, b, d, e] = [0, 1, 2, 3].map((j) => (k + j < first ? planes[k + j] : out));
-      const [p, q, r, s] = [0, 1, 2, 3].map((j) => (k + j < first ? weights[at + 1 + k + j] : 0));
-      blend(out, from, k ? 0 : weights[at], a, b, d, e, p, q, r, s);
+    for (let n = 0; n < Math.max(Math.ceil(first / 3), plain.length, 1); n++, from = out) {
+      const [a, b, d] = [0, 1, 2].map((j) => (3 * n + j < first ? planes[3 * n + j] : out));
+      const [p, q, r] = [1, 2, 3].map((j) => (3 * n + j <= first ? row[3 * n + j] : 0));
+      blend(out, from, n ? 0 : row[0], a, b, d, p, q, r, planes[plain[n]] ?? none, row[1 + plain[n]] ?? 0);
     }
-    for (let k = first; k < planes.length; k++) if (weights[at + 1 + k]) add(out, planes[k], weights[at + 1 + k]);
   });
   return values;
 }
 
-function blend(out, from, offset, a, b, c, d, p, q, r, s) {
-  for (let i = 0; i < out.length; i++) out[i] = from[i] + offset + p * a[i] + q * b[i] + r * c[i] + s * d[i];
-}
-
-function add(out, plane, weight) {
-  for (let i = 0; i < out.length; i++) out[i] += weight * plane[i];
+function blend(out, from, offset, a, b, c, p, q, r, plain, s) {
+  for (let i = 0; i < out.length; i++) out[i] = from[i] + offset + p * a[i] + q * b[i] + r * c[i] + s * plain[i];
 }
 
 /** Turn numbers of an array into what they stand for, in place where that is possible. */
