@@ -20,6 +20,7 @@ JUDGED = "by judgement"
 NO_IMAGES = "the captures have images; it counts only for Gaussians without"
 IMAGE_PATH = "only the image path uses it, the paper's recipe, which is not run here"
 LAMPS = "only lamps use it; relit views have none"
+EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 NO_SCORE = "it decides what is reported, and moves no score"
 BINARY = "a list of powers of two"
@@ -324,13 +325,39 @@ MATERIALS = (
     *(
         Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, EXACT_RIGS)
         for name, does in (
-            ("OWN_ERROR", "Correction that may be the method's own error [pixel]."),
-            ("FREEDOM", "Independent numbers that an image tells of its camera."),
-            ("FIELD", "Side of the fields that are fitted apart [pixel]."),
+            ("CERTAIN", "Corrections of a rig that are made [standard error]."),
+            ("CERTAIN_ALONE", "Those of one camera alone [standard error]."),
             ("MOST_BEHIND", "How much worse a camera that is left out is met [dB]."),
-            ("SHIFT_SHARE", "Steps of shifts over those of turns."),
-            ("MOMENTS", "Decay of the moments of a camera's steps."),
-            ("FAR", "Move after which a level is taken again [pixel]."),
+            ("ALIKE", "Quality of a photograph that is not left out [dB]."),
+            ("OVERSTEP", "Steps over what photographs say."),
+            ("SETTLED", "Steps that end the rounds [standard error]."),
+            ("FAR", "Step that is taken at a coarser level first [pixel of the level]."),
+            ("WORST_ERROR", "Standard error from which silhouettes are asked [pixel]."),
+            ("POOR", "Quality below which silhouettes are asked [dB]."),
+        )
+    ),
+    *(
+        Constant(f"beam_warp.reconstruction.alignment:{name}", "walker, runner, robot", does, EXACT_RIGS)
+        for name, does in (
+            ("FIELD", "Side of the fields whose scores are told apart [pixel]."),
+            ("OUTLIER", "Differences beyond it count by their sign [robust standard deviation]."),
+            ("SEEN", "Coverage of a pixel that has a depth of its own."),
+            ("MODEL_ERROR", "Standard errors over what the scatter of fields says."),
+        )
+    ),
+    *(
+        Constant(f"beam_warp.reconstruction.masks:{name}", "walker, runner, robot", does, EXACT_MASKS)
+        for name, does in (
+            ("LEAST_RING", "Width from which a ring without light is no darkness of the subject [pixel]."),
+            ("FADING", "Distance from the outline to a ring that colour fades to [pixel]."),
+            ("SHARP", "Distance from the outline to a ring where colour ends at once [pixel]."),
+            ("RING_ERROR", "Standard error of an offset that is read from a ring [pixel]."),
+            ("LEAST_MOVE", "Offset from which a mask without a ring is moved [pixel]."),
+            ("MOST_GAUSSIANS", "Gaussians of a fit that shows offsets."),
+            ("VISITS", "How often it looks at each view."),
+            ("ROUNDS", "Most fits."),
+            ("GAIN", "Offsets over what a fit shows of them."),
+            ("SETTLED", "Motion of the masks at which fits end [pixel]."),
         )
     ),
     *(
@@ -342,6 +369,9 @@ MATERIALS = (
             ("LEAST_TURN", "Least turn that is undone [degree]."),
             ("LARGEST_TURN", "Largest turn that is undone [degree]."),
             ("CERTAIN", "Standard errors from which on a turn is undone."),
+            ("LEAST_EXPLAINED", "Differences that other light explains, from which on a light is another place's."),
+            ("LEAST_MISSING", "Size of that other light."),
+            ("MOST_ALIKE", "Part of normals that places may tell."),
         )
     ),
     *(
@@ -425,7 +455,8 @@ UNTUNED = {
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
         beam_warp.materials.light_turn: TURNS
-        beam_warp.reconstruction.rig: CHANCE FOCAL_EDGE
+        beam_warp.reconstruction.masks: FEWEST_VIEWS SIDE SAMPLES WINDOW
+        beam_warp.reconstruction.rig: MOST_LEFT_OUT
         beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
@@ -456,8 +487,9 @@ UNTUNED = {
         beam_warp.reconstruction.gains: LARGEST_SIDE MOST_POINTS DARKEST ROUNDS SETTLED
         beam_warp.reconstruction.hull: MIN_RESOLUTION MAX_RESOLUTION SEARCH_BLOCKS SEARCH_ROUNDS ENOUGH SEARCH_SIDE
         beam_warp.reconstruction.hull: DISTANCE_LIMIT
-        beam_warp.reconstruction.rig: FEWEST_CAMERAS MOST_REPEATS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
+        beam_warp.reconstruction.rig: FEWEST_CAMERAS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
         beam_warp.reconstruction.rig: SHORTEST_SIDE
+        beam_warp.reconstruction.alignment: NUMBERS
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING
@@ -473,8 +505,8 @@ UNTUNED = {
         beam_warp.materials.images: UNLIT_PART WHOLE_ALPHA CROP_MARGIN UNSEEN_EVIDENCE
         beam_warp.materials.light: ASKED MOST_VIEWS NEAR
         beam_warp.materials.light_fits: LIGHT_ROWS LIGHT_COLUMNS EVEN LEAST_LIGHT BLOCKS LEAST_IN_BLOCK LEAST_POINTS
-        beam_warp.materials.light_fits: LEAST_VIEWS
-        beam_warp.materials.light_turn: SPLIT LEAST_COLOR LEAST_LIGHT FLAT
+        beam_warp.materials.light_fits: LEAST_VIEWS VIEW_THREADS
+        beam_warp.materials.light_turn: SPLIT LEAST_COLOR LEAST_LIGHT FLAT ROUNDS SMALLEST_DIFFERENCE PULL
         beam_warp.materials.residues: LEAST_ALPHA FEWEST_LIGHT_SAMPLES
         beam_warp.materials.roughness: MOST_ASKED TINY
         beam_warp.materials.roughness_source: MAX_TEXELS

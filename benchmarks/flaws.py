@@ -18,7 +18,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -26,12 +26,13 @@ from typing import Any
 
 import numpy as np
 import record
+from numpy.typing import NDArray
 from parts import Row
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
+from beam_warp.capture.corrections import RigCorrection, move_between, read_corrections
 from beam_warp.capture.findings import Finding
-from beam_warp.capture.views import CapturedView
 from beam_warp.cli.reconstruct import Modelling
 from beam_warp.cli.run import Run
 from beam_warp.cli.run import run as run_job
@@ -41,13 +42,14 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import BeamError
 from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
-from beam_warp.materials.evidence import view_evidence
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.rig import in_gauge, pixels_of
 from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.stability.capture_cases.case import Detection, detections_of, in_words
 from beam_warp.stability.flaws.write import FLAWS, STUDIO, FlawedCapture, write_flawed
-from beam_warp.study.materials import without_color
 from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
@@ -55,14 +57,21 @@ CLEAN, TOGETHER = "clean", "flawed"
 SIZELESS = (CLEAN, "plate")
 """Cases that have one size only."""
 
-LEAST_PIXELS = 0.1
-"""A Gaussian's truth is known where test views show at least so much of it."""
+MATERIALS = {"base_color": ("base_color.R", "base_color.G", "base_color.B"), "roughness": ("roughness",)}
+SOLID = 0.99
+"""Channels whose stated errors are compared with the truth's layers, and coverage by which a pixel shows the subject
+alone."""
 
 NAMED: Mapping[str, Collection[str]] = {
-    "exposure": ("camera-exposure",),
+    "exposure": ("camera-exposure", "camera-white-balance"),
+    "noise": ("noisy-images",),
     "masks": ("mask-offset",),
+    "cutouts": ("mask-offset",),
     "light": ("environment-turned", "environment-exposure"),
     "clipping": ("clipped-images",),
+    "defocus": ("soft-images",),
+    "motion-blur": ("motion-blur",),
+    "jpeg": ("jpeg-loss",),
     "poses": ("camera-poses",),
     "wrong-camera": ("sees-nothing", "camera-contradicts"),
     "missing-image": ("missing-image",),
@@ -111,7 +120,10 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     said = [*reconstruction["findings"], *decomposition["findings"]]
     said += [finding for frame in reconstruction["frames"] for finding in frame["findings"]]
     row |= told(copy, name, [Finding(**finding) for finding in said])
+    rig = read_corrections(out / "reconstruction")
+    surface = converters.read(out / "asset.usda")[0]
     row["recovered"] = recovered(copy, reconstruction, decomposition)
+    row["recovered"] |= recovered_poses(clean, copy.capture, rig, change_axes(surface, "rfu").positions)
     row["gaussians"] = decomposition["input"]["gaussians"]
     evaluated = time.perf_counter()
     sequence = in_units_of(converters.read(out / "asset.usda"), copy.white)
@@ -147,16 +159,85 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
     """Return parameters that the product reports, beside those that were injected.
 
     ``light_stops``: how much brighter the light was made; it should be minus what was injected.
-    ``exposure_spread``: largest exposure of a camera over the middle one [stop]; 0 where none is known.
+    ``exposure_spread``: largest exposure of a camera over the mean [stop]; 0 where none is known.
     """
     stops = [flaws.get("exposure_stops", 0.0) for flaws in copy.injected["cameras"].values()]
-    spreads = [frame["exposure_spread"] for frame in reconstruction["frames"] if "exposure_spread" in frame]
+    exposures = reconstruction["exposures"]
+    spreads = [] if exposures is None else [abs(camera["stops"]) for camera in exposures["cameras"]]
     return {
         "light_stops": decomposition["exposure_stops"],
         "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
         "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
+        **({} if exposures is None else gain_errors(copy.injected["cameras"], exposures["cameras"])),
     }
+
+
+def recovered_poses(
+    clean: Capture, copy: Capture, rig: RigCorrection | None, surface: NDArray[np.floating]
+) -> dict[str, float]:
+    """Return how far cameras are from the true ones as the copy states them, and as they were found.
+
+    A motion and a scale of the world, which no photograph tells, are taken out first: those of least squares in pixels.
+
+    Args:
+        clean: The capture with the true cameras.
+        copy: The flawed copy.
+        rig: What was found; None for nothing.
+        surface: Points of the subject [m], ``(N, 3)``.
+
+    Returns:
+        Root mean squares over the cameras that are left: ``pose_pixels`` of what moves in the image, and ``pose_mm`` of
+        the camera's place, both with ``_injected``, too; how far the world was moved by that, ``gauge_mm``.
+    """
+    true = {entry.camera_name: entry.camera for entry in clean.select(split="train")}
+    records = copy.select(split="train")
+    found = {entry.camera_name: entry.camera for entry in (records if rig is None else rig.corrected(records))}
+    given = {entry.camera_name: entry.camera for entry in records if entry.camera_name in found}
+    result = {}
+    for ending, cameras in (("_injected", given), ("", found)):
+        pixels, metres, world = apart([true[name] for name in cameras], list(cameras.values()), surface)
+        result |= {f"pose_pixels{ending}": pixels, f"pose_mm{ending}": 1e3 * metres}
+        result[f"gauge_mm{ending}"] = 1e3 * float(np.linalg.norm(world[3:6]))
+    return result
+
+
+def apart(
+    true: Sequence[Camera], found: Sequence[Camera], surface: NDArray[np.floating]
+) -> tuple[float, float, NDArray[np.float64]]:
+    """Return how far cameras are from true ones, in the image [pixel] and in place [m], and the world's motion."""
+    points = surface[:: max(1, len(surface) // 500)].astype(np.float64)
+    moves = np.array([[*move_between(*pair), 0.0, 0.0] for pair in zip(true, found, strict=True)])
+    moves, world = in_gauge(true, moves, points, ("turn", "shift"))
+    pixels = [pixels_of(*pair, points) for pair in zip(true, moves, strict=True)]
+    return float(np.sqrt(np.mean(np.square(pixels)))), float(np.sqrt(np.square(moves[:, 3:6]).sum(1).mean())), world
+
+
+def gain_errors(injected: Row, cameras: Sequence[Row]) -> dict[str, float]:
+    """Return root mean square errors of the cameras' gains over those of the rig, natural logarithms.
+
+    ``exposure`` is the mean of red, green and blue, ``white_balance`` what these differ from it. ``found`` is before
+    anything is judged, ``error`` what is left where it was undone.
+
+    Args:
+        injected: Flaws of each camera that has some, by name.
+        cameras: What was found of each.
+    """
+    true, found, undone = [], [], []
+    for camera in cameras:
+        flaws = injected.get(camera["camera"], {})
+        red, blue = flaws.get("white_balance", (0.0, 0.0))
+        true.append(np.log(2.0) * flaws.get("exposure_stops", 0.0) + np.log1p([red, 0.0, blue]))
+        found.append(np.log(2.0) * camera["stops"] + np.array(camera["balance"]))
+        undone.append(np.log(camera["gains"]))
+    errors = {}
+    for word, logs in (("found", found), ("error", undone)):
+        off = np.stack(logs) - np.stack(true)
+        off -= off.mean(axis=0)
+        exposure = off.mean(axis=1, keepdims=True)
+        errors[f"exposure_{word}"] = float(np.sqrt(np.mean(np.square(exposure))))
+        errors[f"white_balance_{word}"] = float(np.sqrt(np.mean(np.square(off - exposure))))
+    return errors
 
 
 def in_units_of(sequence: GaussianSequence, white: float) -> GaussianSequence:
@@ -190,33 +271,50 @@ def scores(found: Row) -> Row:
 def stated_errors(sequence: GaussianSequence, clean: Capture, frame: int, device: str) -> Row:
     """Return how errors of the first frame's materials compare with the standard errors that the asset states.
 
-    The truth of test views is spread back over the Gaussians that they show. Normally distributed errors that are
-    stated rightly have a median |z| of 0.67, 68 % within 1 and 95 % within 2.
+    Both are drawn, and compared in the pixels of test views that show the subject alone: a Gaussian's own value is seen
+    by nobody, and neighbours in a fit err against each other in what their sum shows rightly. Normally distributed
+    errors that are stated rightly have a median |z| of 0.67, 68 % within 1 and 95 % within 2. A light that is stated
+    too bright makes all base colours too dark by one factor, of which errors say nothing: ``base_color_scaled`` is
+    without it.
     """
     cloud = change_axes(sequence[0], "rfu")
     records = [entry for entry in clean.select(split="test", frames=[frame]) if entry.truth_path is not None]
-    raster, found = RasterOptions.from_metadata(sequence.metadata), {}
-    for name, layers in (("base_color", [f"base_color.{hue}" for hue in "RGB"]), ("roughness", ["roughness"] * 3)):
-        shown = []
-        for entry in records:
-            truth = entry.truth()
-            alpha = np.clip(truth.channels["A"], 0.0, 1.0).astype(np.float32)
-            color = (truth.stack(*layers) * alpha[..., None]).astype(np.float32)
-            shown.append(CapturedView(name=entry.name, camera=entry.camera, color=color, alpha=alpha))
-        cameras = [entry.camera for entry in records]
-        colors = view_evidence(without_color(cloud), cameras, shown, options=raster, device=device).colors.numpy()
-        weights = colors[..., 3:].astype(np.float64)
-        known = weights.sum(axis=0)[:, 0] >= LEAST_PIXELS
-        true = (colors[..., :3] * weights).sum(axis=0)[known] / weights.sum(axis=0)[known]
-        value, error = (np.broadcast_to(getattr(cloud, key).T, (3, len(cloud))).T for key in (name, f"{name}_error"))
-        z = np.abs(value[known] - true) / np.maximum(error[known], 1e-6)
-        found[name] = {
-            "known": float(known.mean()),
-            "median_z": float(np.median(z)),
-            "within_1": float((z <= 1.0).mean()),
-            "within_2": float((z <= 2.0).mean()),
-        }
+    drawn = rasterize(
+        cloud,
+        [entry.camera for entry in records],
+        channels=[f"{name}{of}" for name in MATERIALS for of in ("", "_error")],
+        options=RasterOptions.from_metadata(sequence.metadata),
+        device=device,
+    )
+    truths = [entry.truth() for entry in records]
+    shown = [(truth.channels["A"] > SOLID) & (image.alpha > SOLID) for truth, image in zip(truths, drawn, strict=True)]
+    found = {}
+    for name, layers in MATERIALS.items():
+        true, value, error = (
+            np.concatenate([image[at].reshape(at.sum(), -1) for image, at in zip(images, shown, strict=True)])
+            for images in (
+                [truth.stack(*layers) for truth in truths],
+                [image.channels[name] for image in drawn],
+                [image.channels[f"{name}_error"] for image in drawn],
+            )
+        )
+        found[name] = shares(value - true, error)
+        if name == "base_color":
+            scale = (value * true).sum(axis=0) / (value**2).sum(axis=0)
+            found["base_color_scaled"] = shares(scale * value - true, scale * error)
     return found
+
+
+def shares(errors: NDArray[Any], stated: NDArray[Any]) -> Row:
+    """Return how many errors lie within one and two stated ones, the median of their ratio, and both in the mean."""
+    z = np.abs(errors) / np.maximum(stated, 1e-6)
+    return {
+        "median_z": float(np.median(z)),
+        "within_1": float((z <= 1.0).mean()),
+        "within_2": float((z <= 2.0).mean()),
+        "root_mean_square": float(np.sqrt(np.square(errors, dtype=np.float64).mean())),
+        "stated": float(np.sqrt(np.square(stated, dtype=np.float64).mean())),
+    }
 
 
 def capture_of(name: str, data: Path, folder: Path, device: str) -> Capture:

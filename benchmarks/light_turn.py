@@ -1,4 +1,4 @@
-"""How well are a small turn of the light, and its scale, told? Walker, runner and robot on their true surfaces.
+"""How well are a small turn of the light, its scale, and another place told? Three captures on their true surfaces.
 
     python benchmarks/light_turn.py [--device cpu] --out JSON
 
@@ -6,7 +6,8 @@ Of each capture, Gaussians on the true surface of its first frame are asked, so 
 `beam_warp.materials.light_turn` leaves out; two disjoint halves of them are two subsets. The light is stated turned by
 each of `TURNS`. *Scale* is how bright highlights change from view to view over what the stated light predicts, F0 =
 0.04, in least squares over points and views: 1 where the roughness is right and normals are exact. Tilts about level
-axes are not looked for.
+axes are not looked for. *Other places*: lights of other captures, and those that captures are relit with, brought to
+the same mean, in turn; what is said of each.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from beam_warp.capture.capture import Capture
 from beam_warp.device.arrays import resolve_device
 from beam_warp.materials import light_fits
 from beam_warp.materials.evidence import view_evidence
-from beam_warp.materials.light import light_evidence, possible_scales
+from beam_warp.materials.light import judge_light, light_evidence, possible_scales
 from beam_warp.materials.light_fits import LightEvidence
 from beam_warp.materials.light_turn import find_turn
 from beam_warp.materials.normals import SurfacePoints
@@ -36,7 +37,9 @@ CAPTURES = ("walker", "runner", "robot")
 TURNS = (0.0, 2.0, -2.0, 4.0, -4.0, 8.0, -8.0)
 ROUGHNESSES = (0.3, 0.5, 0.7)
 GAUSSIANS = 30_000
-ASKED = 2048
+ASKED = 4096
+SAME_LIGHT = 0.1
+"""Mean difference of two lights of mean 1 below which they are the same."""
 
 
 def evidence_of(capture: Capture, device: str) -> LightEvidence:
@@ -75,6 +78,37 @@ def turns(evidence: LightEvidence, light: EnvironmentMap) -> list[dict[str, Any]
     return found
 
 
+def places(data: Path) -> dict[str, EnvironmentMap]:
+    """Return all different lights of captures, the ones that they are relit with included, of one mean radiance."""
+    found: dict[str, EnvironmentMap] = {}
+    for path in sorted(data.glob("captures/*/environment.exr")) + sorted(data.glob("captures/*/truth/*.exr")):
+        if path.stem.startswith("test_"):
+            continue
+        light = EnvironmentMap.read(path).resized(64, 128)
+        light = light.scaled(1.0 / float(light.mean_radiance().mean()))
+        if not any(is_same(light, other) for other in found.values()):
+            found[f"{path.parent.name} {path.stem}".removeprefix("truth ").removesuffix(" environment")] = light
+    return found
+
+
+def is_same(light: EnvironmentMap, other: EnvironmentMap) -> bool:
+    """Return whether two lights of one mean are the same up to how they were sampled."""
+    return bool(np.abs(light.resized(16, 32).radiance - other.resized(16, 32).radiance).mean() < SAME_LIGHT)
+
+
+def of_other_places(
+    evidence: LightEvidence, light: EnvironmentMap, others: dict[str, EnvironmentMap]
+) -> dict[str, dict[str, Any]]:
+    """Return what is said of every light, brought to the mean of the right one."""
+    mean = float(light.mean_radiance().mean())
+    found = {}
+    for name, other in others.items():
+        check = judge_light(evidence, other.scaled(mean))
+        said = [finding.code for finding in check.findings if finding.severity == "warning"]
+        found[name] = {"is_right": is_same(other, light.resized(64, 128).scaled(1.0 / mean)), "said": said}
+    return found
+
+
 def highlight_scales(evidence: LightEvidence, light: EnvironmentMap) -> dict[str, dict[str, float]]:
     """Return how bright highlights are over those expected of each roughness, with the jackknife's standard error."""
     shown = light_fits.well_shown(some(evidence, slice(0, None, 2)))
@@ -100,6 +134,7 @@ def main() -> None:
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}
+    others = places(Path(given.data))
     for name in CAPTURES:
         capture = Capture.read(Path(given.data) / "captures" / name)
         assert capture.environment_path is not None
@@ -108,6 +143,7 @@ def main() -> None:
             "turns": turns(evidence, light),
             "highlights": highlight_scales(evidence, light),
             "possible_scales": possible_scales(evidence, light),
+            "places": of_other_places(some(evidence, slice(0, None, 2)), light, others),
         }
         print(name, rows[name], flush=True)
     record.write_result(given, device, {"captures": rows})

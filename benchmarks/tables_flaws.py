@@ -32,7 +32,7 @@ def flaws(result: Row) -> Rows:
 def recovered(result: Row) -> Rows:
     """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""
     head = ["what is wrong", "light made brighter [stop]", "should be", "largest exposure found [stop]", "injected"]
-    head += ["base colour within 1, 2 stated errors", "roughness", "seconds"]
+    head += ["base colour within 1, 2 stated errors", "but for its scale", "roughness", "seconds"]
     return [head, *(_recovered(label, rows) for label, rows in _groups(result))]
 
 
@@ -54,15 +54,21 @@ def _recovered(label: str, rows: Sequence[Row]) -> list[str]:
     """Return the cells of a flaw in the second table."""
     found = [row for row in rows if "scores" in row]
     if not found:
-        return [label, *[""] * 7]
+        return [label, *[""] * 8]
     stops, spread = (_mean(found, "recovered", key) for key in ("light_stops", "exposure_spread"))
     should, injected = (_mean(found, "recovered", f"{key}_injected") for key in ("light_stops", "exposure_spread"))
 
     def within(name: str) -> str:
+        if any(name not in row["errors"] for row in found):
+            return ""
         return ", ".join(f"{100 * _mean(found, 'errors', name, f'within_{count}'):.0f} %" for count in (1, 2))
 
     cells = [label, f"{stops:+.2f}", f"{0.0 - should:+.2f}", f"{spread:.2f}", f"{injected:.2f}"]
-    return [*cells, within("base_color"), within("roughness"), f"{_mean(found, 'seconds', 'run'):.0f}"]
+    return [
+        *cells,
+        *map(within, ("base_color", "base_color_scaled", "roughness")),
+        f"{_mean(found, 'seconds', 'run'):.0f}",
+    ]
 
 
 def _cells(label: str, rows: Sequence[Row]) -> list[str]:

@@ -207,7 +207,8 @@ def light_turn(result: Row) -> Rows:
     for name, found in result["captures"].items():
         turns, highlights = found["turns"], found["highlights"]
         rows = rows or [
-            ["", "light as measured", "worst of all stated turns", "turned, as measured", "turned by 8°"]
+            ["", "light as measured", "worst of all stated turns", "turned, as measured"]
+            + ["turned by 8°", "other places told"]
             + [f"scale at roughness {roughness}" for roughness in highlights]
         ]
 
@@ -216,6 +217,8 @@ def light_turn(result: Row) -> Rows:
             return f"{sum(some)} of {len(some)}"
 
         right = [turn for turn in turns if turn["stated"] == 0.0]
+        elsewhere = [place for place in found["places"].values() if not place["is_right"]]
+        told = sum(place["said"] == ["environment-unexplained"] for place in elsewhere)
         rows.append(
             [
                 name,
@@ -223,6 +226,7 @@ def light_turn(result: Row) -> Rows:
                 f"{max((turn['error'] for turn in turns), key=abs):+.1f}°",
                 applied(0.0, 0.0),
                 applied(8.0, 8.0),
+                f"{told} of {len(elsewhere)}",
                 *(f"{scale['scale']:.2f} ± {scale['standard_error']:.2f}" for scale in highlights.values()),
             ]
         )

@@ -87,6 +87,14 @@ _GLTF = Format(
     axes="rub",
     axes_to_write=("rub", "luf", "bul", "fur"),  # those with y up of a right hand
 )
+_DELIVERY = Format(
+    name="b4d",
+    reader="delivery.reader",
+    writer="delivery.writer",
+    holds_sequences=True,
+    axes="rub",
+    axes_to_write=("rub",),
+)
 _H5 = Format(name="HDF5", reader="arrays", holds_sequences=True)
 
 FORMATS: dict[str, Format] = {
@@ -114,6 +122,7 @@ FORMATS: dict[str, Format] = {
         holds_sequences=True,
         read_options=OF_ANY_FORMAT | {"activation", "material_activation"},
     ),
+    **dict.fromkeys((".b4d", "manifest.json"), _DELIVERY),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
 }
 """Suffix → format. Of two suffixes that fit a name, the longer one counts."""

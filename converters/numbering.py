@@ -16,6 +16,9 @@ ASSET_NAME = "asset.usda"
 SOG_NAMES = ("lod-meta.json", "meta.json")
 """Names of the files that describe a streamed SOG, and the images of a SOG, in a folder."""
 
+DELIVERY_NAME = "manifest.json"
+"""Name of the file that describes a take of the container b4d in a folder."""
+
 LCC_SUFFIXES = (".lcc", ".lcc2")
 """Ends of the names of indices that a folder holds once, whatever they are called."""
 
@@ -51,7 +54,8 @@ def holds_a_frame(name: str) -> bool:
 def files_at(path: Path) -> list[Path]:
     """Return the files of Gaussians at a path: the file itself, or of a folder its asset, its SOG or its frames.
 
-    A folder with ``asset.usda`` is that asset, one with ``lod-meta.json`` or ``meta.json`` that SOG, one with a single
+    A folder with ``asset.usda`` is that asset, one with ``lod-meta.json`` or ``meta.json`` that SOG, one with
+    ``manifest.json`` that b4d, one with a single
     index of LCC that scene, and any other a numbered sequence. This is the only place that decides it.
 
     Raises:
@@ -60,7 +64,7 @@ def files_at(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
-    whole = next((path / name for name in (ASSET_NAME, *SOG_NAMES) if (path / name).is_file()), None)
+    whole = next((path / name for name in (ASSET_NAME, *SOG_NAMES, DELIVERY_NAME) if (path / name).is_file()), None)
     return [whole] if whole is not None else _files_in(path)
 
 

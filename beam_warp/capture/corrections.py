@@ -7,7 +7,7 @@ corrected: a rig's mean holds the world in its place, and what is rendered for o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,9 +40,11 @@ class CameraCorrection:
         shift: Shift in the same axes [m], ``(3,)``: a point p in them comes to be at turn(p) + shift.
         log_focal: Natural logarithm of the factor of both focal lengths.
         pixels: How far this moves the surface in the image, root mean square [pixel].
-        error: Standard error of that [pixel]; a bound on it in a rig that the first half of the pixels found sound.
+        error: Standard error of that [pixel].
         psnr: Quality that the camera's image was met with [dB].
         is_used: False for a camera that could not be reconciled with the others, and is left out.
+        center: Way of the principal point, right and down [focal length], ``(2,)``.
+        place_error: Standard error with which the images tell the camera's place, whether it is moved or not [m].
     """
 
     camera: str
@@ -53,19 +55,30 @@ class CameraCorrection:
     error: float = 0.0
     psnr: float = 0.0
     is_used: bool = True
+    center: tuple[float, float] = (0.0, 0.0)
+    place_error: float = 0.0
 
     def __post_init__(self) -> None:
         """Check every number once: they come from files too."""
-        for name in ("turn", "shift"):
-            vector = require_array(name, getattr(self, name), (3,), np.float64)
+        for name, size in (("turn", 3), ("shift", 3), ("center", 2)):
+            vector = require_array(name, getattr(self, name), (size,), np.float64)
             require_finite(name, vector)
             object.__setattr__(self, name, tuple(vector.tolist()))
-        for name, low, high in (("log_focal", -1.0, 1.0), ("pixels", 0.0, 1e6), ("error", 0.0, 1e6)):
+        for name, low, high in (
+            ("log_focal", -1.0, 1.0),
+            ("pixels", 0.0, 1e6),
+            ("error", 0.0, 1e6),
+            ("place_error", 0.0, 1e6),
+        ):
             require_number(name, getattr(self, name), low, high)
+
+    def summary(self) -> str:
+        """Return how far the camera was moved, and how sure that is, in a few characters."""
+        return f"{self.pixels:.2f} ± {self.error:.2f} px" if self.is_used else "contradicts"
 
     def applied(self, camera: Camera) -> Camera:
         """Return the corrected camera."""
-        return moved_camera(camera, (*self.turn, *self.shift, self.log_focal))
+        return moved_camera(camera, (*self.turn, *self.shift, self.log_focal, *self.center))
 
 
 @dataclass(frozen=True)
@@ -75,12 +88,29 @@ class RigCorrection:
     Attributes:
         cameras: One for each camera, moved or not.
         is_applied: False where what was found is no more than chance and the method's own error: then nothing moves.
-        confidence: Ratio of the mean squares of what was found and of its standard errors; 0 where it was not needed.
+        confidence: Ratio of the mean squares of what was found and of its standard errors.
+        kinds: Kinds of numbers that were moved: turn, focal, shift, center.
+        world: The motion of the world that was taken out of the corrections, because no photograph tells it: turn
+            [rad], shift [m] and the logarithm of scale, about the subject's middle, ``(7,)``.
     """
 
     cameras: tuple[CameraCorrection, ...]
     is_applied: bool
     confidence: float
+    kinds: tuple[str, ...] = ()
+    world: tuple[float, ...] = (0.0,) * 7
+
+    def ways(self, cameras: Mapping[str, Camera], point: ArrayLike) -> dict[str, NDArray[np.float64]]:
+        """Return which way corrections move a point in the images of cameras that were moved [pixel], ``(2,)`` each.
+
+        Args:
+            cameras: Cameras as they are stated, by name.
+            point: A point of the subject [m], ``(3,)``.
+        """
+        where = np.asarray(point, np.float64)[None]
+        moved = [camera for camera in self.cameras if camera.camera in cameras and camera.is_used and self.is_applied]
+        pairs = {camera.camera: (cameras[camera.camera], camera.applied(cameras[camera.camera])) for camera in moved}
+        return {name: (after.project(where) - before.project(where))[0, :2] for name, (before, after) in pairs.items()}
 
     @property
     def pixels(self) -> float:
@@ -110,6 +140,15 @@ class RigCorrection:
     def capture(self, capture: Capture) -> Capture:
         """Return the capture with its training cameras corrected."""
         return Capture(**{**vars(capture), "records": self.corrected(capture.records)})
+
+    def summary(self) -> str:
+        """Return what was moved, and how sure that is, in one line."""
+        known = f"{self.pixels:.2f} ± {self.error:.2f} pixels"
+        if not self.is_applied:
+            return f"cameras agree to {known}, and are as stated"
+        place = 1e3 * _root_mean_square([camera.place_error for camera in self.cameras])
+        told = f"; images tell places to ± {place:.1f} mm" if place else ""
+        return f"cameras moved by {known} ({', '.join(self.kinds)}){told}"
 
     def findings(self) -> list[Finding]:
         """Return what a user should know about the cameras."""
@@ -148,6 +187,8 @@ class RigCorrection:
             "confidence": self.confidence,
             "pixels": self.pixels,
             "error": self.error,
+            "kinds": list(self.kinds),
+            "world": list(self.world),
             "cameras": [asdict(camera) for camera in self.cameras],
         }
 
@@ -161,7 +202,10 @@ class RigCorrection:
         try:
             cameras = tuple(CameraCorrection(**camera) for camera in content["cameras"])
             confidence = require_number("confidence", content["confidence"], 0.0)
-            return cls(cameras, bool(content["is_applied"]), confidence)
+            world = require_array("world", content.get("world", (0.0,) * 7), (7,), np.float64)
+            require_finite("world", world)
+            kinds = tuple(str(kind) for kind in content.get("kinds", ()))
+            return cls(cameras, bool(content["is_applied"]), confidence, kinds, tuple(world.tolist()))
         except (BeamError, KeyError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise AssetFormatError(
@@ -194,8 +238,8 @@ def moved_camera(camera: Camera, move: ArrayLike) -> Camera:
 
     Args:
         camera: The camera.
-        move: Turn [rad], shift [m] and the logarithm of the factor of the focal lengths, ``(7,)``, as in
-            `CameraCorrection`.
+        move: Turn [rad], shift [m], the logarithm of the factor of the focal lengths and the principal point's way
+            [focal length], ``(9,)``, as in `CameraCorrection`.
     """
     numbers = np.asarray(move, np.float64)
     motion = np.eye(4)
@@ -205,15 +249,18 @@ def moved_camera(camera: Camera, move: ArrayLike) -> Camera:
         camera,
         focal_x=camera.focal_x * factor,
         focal_y=camera.focal_y * factor,
+        center_x=camera.center_x + camera.focal_x * float(numbers[7]),
+        center_y=camera.center_y + camera.focal_y * float(numbers[8]),
         camera_to_world=camera.camera_to_world @ np.linalg.inv(motion),
     )
 
 
 def move_between(camera: Camera, other: Camera) -> NDArray[np.float64]:
-    """Return the move, ``(7,)``, with which `moved_camera` makes one camera the other, of the same pixel's shape."""
+    """Return the move, ``(9,)``, with which `moved_camera` makes one camera the other, of the same pixel's shape."""
     motion = np.linalg.inv(other.camera_to_world) @ camera.camera_to_world
     turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-    return np.array([*turn, *motion[:3, 3], np.log(other.focal_x / camera.focal_x)])
+    center = ((other.center_x - camera.center_x) / camera.focal_x, (other.center_y - camera.center_y) / camera.focal_y)
+    return np.array([*turn, *motion[:3, 3], np.log(other.focal_x / camera.focal_x), *center])
 
 
 def _root_mean_square(values: Sequence[float]) -> float:

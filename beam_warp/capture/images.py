@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.capture.findings import Findings, are, count_of, names_of
+from beam_warp.capture.findings import Finding, Findings, are, count_of, names_of
 from beam_warp.capture.mattes import MaskOffset
+from beam_warp.capture.quality import ImageQuality, quality_of
 from beam_warp.capture.records import CaptureRecord
 from beam_warp.image.color import LUMINANCE
 from beam_warp.image.files import display_image
@@ -36,6 +37,21 @@ BLACK = 1e-4
 MASK_PIXELS, MASK_ERRORS = 0.5, 3.0
 """Masks that are off by more than so many pixels and so many standard errors are reported."""
 
+SOFT_PIXELS, SURELY_SOFT = 0.4, 0.7
+"""Blur that is reported [pixel]: the first where coverage shows it, or the median of all photographs does; the second
+of a single photograph, whose shading widens edges by up to 0.5. A circle of confusion of two pixels is 0.5, and costs
+novel views 3 dB; sharp renderings are below 0.1."""
+
+STREAKED = 0.5
+"""Blur whose least deviation is below this part of its largest is one of motion."""
+
+NOISY = 0.05
+"""Noise of a pixel over its value, in the middle of the subject's levels, from which on images are reported."""
+
+LOSSY = 3.5
+"""Errors of a JPEG's luminance from which on it is reported [level of 255]: those of quality 90 of libjpeg's 100, which
+costs base colour 3 dB, and of less."""
+
 SOLID = 0.5
 """A pixel belongs to the subject if its alpha is above this."""
 
@@ -52,6 +68,7 @@ class Glimpse:
         exposure: Median luminance of the subject, or of all where coverage is not known, as a power of two; None for
             an image without a subject, or a black one.
         coverage: Mean alpha; None if it is unknown.
+        quality: How sharp and how noisy it is.
         mask_offset: How far the mask reached beyond the subject; None if nothing tells.
     """
 
@@ -61,6 +78,7 @@ class Glimpse:
     brightest: float
     exposure: float | None
     coverage: float | None
+    quality: ImageQuality
     mask_offset: MaskOffset | None = None
 
 
@@ -71,6 +89,7 @@ def glimpse_of(record: CaptureRecord) -> Glimpse:
         MissingFileError, AssetFormatError: See `CaptureRecord.view`.
     """
     view = record.view()
+    quality = quality_of(record, view)
     factor = max(1, max(view.camera.width, view.camera.height) // GLIMPSE_SIDE)
     view = view.reduced(min(factor, view.camera.width, view.camera.height))
     color, alpha = view.color, view.alpha
@@ -86,6 +105,7 @@ def glimpse_of(record: CaptureRecord) -> Glimpse:
         brightest=float(view.color.max()),
         exposure=float(np.log2(level)) if level > 0.0 else None,
         coverage=None if alpha is None else float(alpha.mean()),
+        quality=quality,
         mask_offset=view.mask_offset,
     )
 
@@ -131,6 +151,7 @@ def judge_images(training: Sequence[CaptureRecord], glimpses: Sequence[Glimpse],
     shown = [glimpse for glimpse in glimpses if glimpse not in black and glimpse not in empty]
     _judge_coverage(shown, findings)
     _judge_outlines(shown, findings)
+    _judge_quality(shown, findings)
     names = {record.name for record in training}
     _judge_exposure([glimpse for glimpse in shown if glimpse.record.name in names], findings)
     return left_out
@@ -168,7 +189,7 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
             "no-coverage",
             "images have no alpha and no masks: background counts as the subject does, and there is no visual hull",
             remedy="For a subject by itself, write masks (masks/<image>.png, white on the subject) or plates "
-            "(plates/<camera>.png, without the subject).",
+            "(plates/<camera>.png, without the subject; beam plates makes them where the subject moves).",
         )
         return
     unknown = [glimpse for glimpse in glimpses if glimpse.alpha is None]
@@ -191,12 +212,13 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
         )
     full = [glimpse for glimpse, alpha in known if float(alpha.min()) > 0.99]
     if full:
-        findings.warn(
+        findings.add(
+            "error" if len(full) == len(glimpses) else "warning",
             "full-mask",
             f"mask or alpha of {count_of(len(full), 'image')} of {len(known)} is white everywhere: background "
             "counts as the subject does",
             _names(full),
-            "Make the masks again, or drop alpha.",
+            "Make masks that are white on the subject alone, or save the images without alpha.",
         )
     inverted = [glimpse for glimpse, alpha in known if glimpse not in full and _is_inverted(alpha)]
     if inverted:
@@ -221,13 +243,73 @@ def _judge_outlines(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     }
     wrong = {name: found for name, found in off.items() if abs(found[0]) > max(MASK_PIXELS, MASK_ERRORS * found[1])}
     if wrong:
-        findings.warn(
-            "mask-offset",
-            f"masks of {count_of(len(wrong), 'camera')} end more than {MASK_PIXELS:g} pixel outside (+) or inside (-) "
-            "of where the subject does, and are moved there",
-            (f"{name} {pixels:+.1f} ± {error:.1f}" for name, (pixels, error) in wrong.items()),
-            "Make them again for outlines that are exact.",
-        )
+        findings.append(offset_finding({name: MaskOffset(*found) for name, found in wrong.items()}))
+
+
+def offset_finding(offsets: Mapping[str, MaskOffset]) -> Finding:
+    """Return the finding that masks of some cameras end elsewhere than the subject does."""
+    return Finding(
+        "warning",
+        "mask-offset",
+        f"masks of {count_of(len(offsets), 'camera')} end outside (+) or inside (-) of where the subject does, and are "
+        "moved there",
+        names_of(f"{name} {found.pixels:+.1f} ± {found.error:.1f}" for name, found in offsets.items()),
+        "Make them again for outlines that are exact.",
+    )
+
+
+def _judge_quality(glimpses: Sequence[Glimpse], findings: Findings) -> None:
+    """Find images that are blurred, noisy, or lost much to compression."""
+    photographs = [glimpse.quality.blur[0] for glimpse in glimpses if not glimpse.quality.by_coverage]
+    told = [blur for blur in photographs if np.isfinite(blur)]
+    limit = SOFT_PIXELS if told and np.median(told) > SOFT_PIXELS else SURELY_SOFT
+    soft, streaked = {}, {}
+    for glimpse in glimpses:
+        least, largest = glimpse.quality.blur
+        if least > (SOFT_PIXELS if glimpse.quality.by_coverage else limit):
+            soft[glimpse.record.name] = least
+        elif glimpse.quality.by_coverage and largest > SOFT_PIXELS and least < STREAKED * largest:
+            streaked[glimpse.record.name] = largest
+    noises = [glimpse.quality.noise for glimpse in glimpses if np.isfinite(glimpse.quality.noise)]
+    noisy = {glimpse.record.name: glimpse.quality.noise for glimpse in glimpses if glimpse.quality.noise > NOISY}
+    if not 2 * len(noisy) > len(noises):
+        noisy = {}  # texture of some views
+    lossy = {glimpse.record.name: glimpse.quality.loss for glimpse in glimpses if glimpse.quality.loss > LOSSY}
+    for found, code, what, form, remedy in (
+        (
+            soft,
+            "soft-images",
+            "blurred in all directions: out of focus, enlarged, or with feathered masks; what is given are standard "
+            "deviations",
+            "{:.1f} px",
+            "The asset will be as soft. Focus again, or take smaller copies of the images: nothing is lost.",
+        ),
+        (
+            streaked,
+            "motion-blur",
+            "blurred in one direction; what is given are standard deviations",
+            "{:.1f} px",
+            "The asset will be as soft. Expose for a shorter time.",
+        ),
+        (
+            noisy,
+            "noisy-images",
+            f"noisy: a pixel is off by more than {NOISY:.0%} of its value in the middle of the subject's levels",
+            "{:.0%}",
+            "Views average it out; base colour and roughness are less certain. Light more, or expose longer.",
+        ),
+        (
+            lossy,
+            "jpeg-loss",
+            f"compressed so that luminance may be off by more than {LOSSY:g} of 255 levels",
+            "{:.1f}",
+            "Base colour loses more than sharpness. Give images without loss, or JPEG of a quality of 95 or more.",
+        ),
+    ):
+        if found:
+            worst = sorted(found, key=lambda name: -found[name])
+            counted = f"{count_of(len(found), 'image')} of {len(glimpses)} {are(found)} {what}"
+            findings.warn(code, counted, (f"{name} {form.format(found[name])}" for name in worst), remedy)
 
 
 def _is_inverted(alpha: NDArray[np.float32]) -> bool:

@@ -154,6 +154,17 @@ def matte(
     return Matte(color, alpha, offset)
 
 
+def moved_mask(mask: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+    """Take a mask in on all sides, or let it out if ``pixels`` is negative.
+
+    Args:
+        mask: Coverage in [0, 1], ``(H, W)``.
+        pixels: How far, at most the 3 that are looked at around an outline [pixel].
+    """
+    outline = _outline(mask)
+    return mask if outline is None else _moved(mask, outline, np.full(len(outline.points), pixels))
+
+
 def keyed(photograph: NDArray[np.float32], plate: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a mask of what differs from an image of the empty scene: a start for `matte`.
 

@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from PIL import Image as PillowImage
 from PIL import ImageColor
 from scipy import ndimage
 
+from beam_warp.capture.corrections import RigCorrection
+from beam_warp.capture.findings import Finding
 from beam_warp.capture.images import Glimpse
 from beam_warp.capture.inspect import CaptureReport
 from beam_warp.capture.picture import (
@@ -25,6 +28,7 @@ from beam_warp.capture.picture import (
     SEVERITY_COLORS,
     VOLUME,
     Rig,
+    all_findings,
     display_pixels,
     headline,
     legend_entries,
@@ -51,8 +55,8 @@ figcaption { display: flex; justify-content: space-between; font-size: 0.8em; co
 """
 
 
-def write_page(report: CaptureReport, path: Path) -> None:
-    """Write a report as one HTML file that needs no network.
+def write_page(report: CaptureReport, path: Path, corrections: RigCorrection | None = None) -> None:
+    """Write a report, and corrections of its cameras, as one HTML file that needs no network.
 
     Raises:
         InvalidOptionError: plotly is not installed.
@@ -61,7 +65,7 @@ def write_page(report: CaptureReport, path: Path) -> None:
     require_package("plotly")
     from plotly.offline import get_plotlyjs
 
-    rig = Rig.of(report)
+    rig = Rig.of(report, corrections)
     glimpses = shown_glimpses(report)
     script = files("beam_warp.capture").joinpath("page.js").read_text(encoding="utf-8")
     # "<" is escaped, so that no text in the data can end the element that holds it
@@ -73,8 +77,8 @@ def write_page(report: CaptureReport, path: Path) -> None:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{name}</title>\n<style>{STYLE}</style>\n<script>{get_plotlyjs()}</script>\n</head>\n<body>\n"
         f'<p class="verdict" style="color: {color}">{html.escape(verdict(report))}</p>\n<h1>{name}</h1>\n'
-        f'<p class="size">{html.escape(headline(report))}</p>\n<div id="rig"></div>\n'
-        f"<ul>{_findings(report)}</ul>\n"
+        f'<p class="size">{html.escape(headline(report, corrections))}</p>\n<div id="rig"></div>\n'
+        f"<ul>{_findings(all_findings(report, corrections))}</ul>\n"
         f'<div class="images">{"".join(_figure(glimpse, rig) for glimpse in glimpses)}</div>\n'
         f'<script type="application/json" id="data">{data}</script>\n<script>{script}</script>\n</body>\n</html>\n'
     )
@@ -82,15 +86,15 @@ def write_page(report: CaptureReport, path: Path) -> None:
         temporary.write_text(page, encoding="utf-8")
 
 
-def _findings(report: CaptureReport) -> str:
-    if not report.findings:
+def _findings(findings: Sequence[Finding]) -> str:
+    if not findings:
         return '<li style="border-color: #2E7D32">Nothing wrong was found.</li>'
     return "".join(
         f'<li style="border-color: {SEVERITY_COLORS[finding.severity]}">'
         f'<b style="color: {SEVERITY_COLORS[finding.severity]}">{finding.severity}</b> {html.escape(finding.what)}. '
         f"{html.escape(finding.remedy)}"
         f"{f'<br><small>{html.escape(finding.where)}</small>' if finding.where else ''}</li>"
-        for finding in report.findings
+        for finding in findings
     )
 
 
@@ -98,11 +102,13 @@ def _figure(glimpse: Glimpse, rig: Rig) -> str:
     """Return the HTML of an image with its mask's outline, its name and its exposure."""
     name = html.escape(glimpse.record.camera_name, quote=True)
     exposure = "" if glimpse.exposure is None else f"{glimpse.exposure:+.1f} EV"
+    moved = rig.correction(glimpse.record.camera_name)
     color = COLORS[rig.kinds[glimpse.record.camera_name]]
     file = io.BytesIO()
     PillowImage.fromarray(_outlined(glimpse)).save(file, "PNG", optimize=True)
     source = base64.b64encode(file.getvalue()).decode("ascii")
-    caption = f"<figcaption><span>{name}</span><span>{exposure}</span></figcaption>"
+    said = "".join(f"<span>{text}</span>" for text in (name, moved, exposure) if text)
+    caption = f"<figcaption>{said}</figcaption>"
     image = f'<img alt="{name}" style="border-color: {color}" src="data:image/png;base64,{source}">'
     return f'<figure data-camera="{name}">{image}{caption}</figure>'
 
@@ -122,7 +128,7 @@ def _data(rig: Rig, glimpses: list[Glimpse]) -> dict[str, Any]:
     by_camera = {glimpse.record.camera_name: glimpse for glimpse in glimpses}
     positions, colors = rig.points
     kinds = [kind for kind in COLORS if kind in rig.kinds.values()]
-    titles = [title for title, _ in legend_entries(rig)]
+    titles = {color: title for title, color in legend_entries(rig)}
     return {
         "cameras": [
             {
@@ -130,18 +136,17 @@ def _data(rig: Rig, glimpses: list[Glimpse]) -> dict[str, Any]:
                 "kind": rig.kinds[name],
                 "position": camera.position.tolist(),
                 "corners": frustum_corners(camera, rig.depth).tolist(),
-                "text": f"{html.escape(name)}<br>{camera.width} x {camera.height}, focal {camera.focal_x:.0f} px",
+                "text": f"{html.escape(name)}<br>{camera.width} x {camera.height}, focal {camera.focal_x:.0f} px"
+                f"{f'<br>moved by {rig.correction(name)}' if name in rig.ways else ''}",
                 "image": _small(by_camera[name]) if name in by_camera else None,
             }
             for name, camera in rig.cameras.items()
         ],
-        "kinds": [
-            {"name": kind, "title": title, "color": COLORS[kind]} for kind, title in zip(kinds, titles, strict=False)
-        ],
+        "kinds": [{"name": kind, "title": titles[COLORS[kind]], "color": COLORS[kind]} for kind in kinds],
         "volume": None
         if rig.volume is None
         else [[rig.volume[a].tolist(), rig.volume[b].tolist()] for a, b in BOX_EDGES],
-        "volumeName": titles[-1],
+        "volumeName": titles.get(VOLUME, ""),
         "volumeColor": VOLUME,
         "points": np.round(positions, 4).tolist(),
         "pointColors": [bytes(color).hex() for color in np.rint(255.0 * colors).astype(np.uint8)],

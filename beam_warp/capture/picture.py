@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from beam_warp.capture.corrections import RigCorrection
 from beam_warp.capture.findings import Finding, count_of
 from beam_warp.capture.images import Glimpse
 from beam_warp.capture.inspect import SPLIT, CaptureReport
@@ -36,6 +37,7 @@ COLORS = {"train": "#0072B2", "other": "#E08214", "left out": "#C51B1B"}
 SEVERITY_COLORS = {"error": "#C51B1B", "warning": "#B36B00", "note": "#555555"}
 OUTLINE = "#00E5FF"
 VOLUME = "#2E8B57"
+ARROW = "#FFD400"
 BACKGROUND = 0.2
 """Display grey behind subjects, on which dark and white ones are both visible."""
 
@@ -53,6 +55,8 @@ class Rig:
         depth: Depth of the drawn frustums [m].
         volume: Corners of the common volume, ``(8, 3)``, or None.
         points: Sparse points and their display colours, ``(P, 3)`` each.
+        corrections: What a reconstruction found wrong with cameras; None if there was none.
+        ways: Which way that moves the subject's middle in the images of cameras that were moved [pixel], ``(2,)`` each.
     """
 
     cameras: dict[str, Camera]
@@ -60,10 +64,12 @@ class Rig:
     depth: float
     volume: NDArray[np.float64] | None
     points: tuple[NDArray[np.float64], NDArray[np.float64]]
+    corrections: RigCorrection | None = None
+    ways: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, report: CaptureReport) -> Rig:
-        """Make the rig of a report."""
+    def of(cls, report: CaptureReport, corrections: RigCorrection | None = None) -> Rig:
+        """Make the rig of a report, and of the corrections of a reconstruction from it."""
         poses = np.array([camera.camera_to_world for camera in report.cameras.values()])
         point = meeting_point(poses)
         if point is None:
@@ -72,6 +78,8 @@ class Rig:
         left = {}
         for record in report.capture.select(split=SPLIT):
             left.setdefault(record.camera_name, []).append(record.name in report.left_out)
+        bad = set() if corrections is None else {camera.camera for camera in corrections.cameras if not camera.is_used}
+        left |= {name: [True] for name in bad & set(left)}
         kinds = {
             name: "other" if name not in left else "left out" if all(left[name]) else "train" for name in report.cameras
         }
@@ -79,7 +87,21 @@ class Rig:
         if report.volume is not None:
             low, high = report.volume
             volume = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i, j, k in BOX])
-        return cls(report.cameras, kinds, DEPTH_SHARE * (distance or 1.0), volume, _shown_points(report))
+        ways = {} if corrections is None else corrections.ways(report.cameras, point)
+        depth = DEPTH_SHARE * (distance or 1.0)
+        return cls(report.cameras, kinds, depth, volume, _shown_points(report), corrections, ways)
+
+    @property
+    def magnification(self) -> float:
+        """How many times larger than they are `ways` are drawn: the largest is a tenth of an image to a whole one."""
+        shares = [np.linalg.norm(way) / self.cameras[name].width for name, way in self.ways.items()]
+        return 10.0 ** float(np.floor(-np.log10(max([*shares, 1e-9]))))
+
+    def correction(self, name: str) -> str:
+        """Return what was found wrong with a camera, in words; empty if nothing is known."""
+        found = [] if self.corrections is None else self.corrections.cameras
+        own = next((camera for camera in found if camera.camera == name), None)
+        return "" if own is None else own.summary()
 
     def labels(self) -> dict[str, str]:
         """Return a label for each camera by name: the name without the start that all cameras of its kind share."""
@@ -151,13 +173,14 @@ def display_pixels(glimpse: Glimpse) -> NDArray[np.uint8]:
     return np.rint(glimpse.pixels * alpha + 255.0 * BACKGROUND * (1.0 - alpha)).astype(np.uint8)
 
 
-def headline(report: CaptureReport) -> str:
-    """Return a capture's size in one line."""
+def headline(report: CaptureReport, corrections: RigCorrection | None = None) -> str:
+    """Return a capture's size, and what was moved of its cameras, in one line."""
     capture = report.capture
     splits = ", ".join(f"{len(capture.select(split=split)):,} {split}" for split in capture.splits)
     return (
         f"{len(report.cameras)} cameras, {count_of(len(capture.frames), 'frame')}, "
         f"{len(capture.records):,} images ({splits}); {len(report.glimpses)} looked at"
+        f"{'' if corrections is None else f'; {corrections.summary()}'}"
     )
 
 
@@ -169,8 +192,13 @@ def verdict(report: CaptureReport) -> str:
     return f"ready, with {count_of(warnings, 'warning')}" if warnings else "ready"
 
 
-def write_picture(report: CaptureReport, path: Path) -> None:
-    """Draw a report as a PNG.
+def all_findings(report: CaptureReport, corrections: RigCorrection | None) -> list[Finding]:
+    """Return the findings of a report and of corrections."""
+    return [*report.findings, *([] if corrections is None else corrections.findings())]
+
+
+def write_picture(report: CaptureReport, path: Path, corrections: RigCorrection | None = None) -> None:
+    """Draw a report as a PNG, and corrections of its cameras as arrows: the way that the subject moved in an image.
 
     Raises:
         InvalidOptionError: matplotlib is not installed.
@@ -181,7 +209,8 @@ def write_picture(report: CaptureReport, path: Path) -> None:
     from matplotlib.figure import Figure
 
     glimpses = shown_glimpses(report)
-    lines = _finding_lines(report.findings)
+    moved = [] if corrections is None else [(corrections.summary().capitalize() + ".", GREY)]
+    lines = [*moved, *_finding_lines(all_findings(report, corrections))]
     aspect = max((g.pixels.shape[0] / g.pixels.shape[1] for g in glimpses), default=1.0)
     columns = -(-len(glimpses) // max(1, -(-len(glimpses) // COLUMNS))) or 1  # rows as even as they can be
     cell = (WIDTH - 0.6) / max(columns, 5)
@@ -201,7 +230,7 @@ def write_picture(report: CaptureReport, path: Path) -> None:
     )
     figure.text(0.3 / WIDTH, 1 - 0.64 / total, headline(report), size=10, color=GREY, va="center")
     figure.text(1 - 0.3 / WIDTH, 1 - 0.36 / total, verdict(report), size=12, color=color, ha="right", va="center")
-    rig = Rig.of(report)
+    rig = Rig.of(report, corrections)
     _legend(figure, rig, total)
     _draw_rig(place(0.1, 0.8, 6.9, 4.9), rig, _outside_view(rig))
     _draw_plan(place(7.55, 1.05, 4.2, 4.2), rig)
@@ -209,7 +238,7 @@ def write_picture(report: CaptureReport, path: Path) -> None:
     for number, glimpse in enumerate(glimpses):
         row, column = divmod(number, columns)
         axes = place(0.3 + column * cell, top + row * (thumb[1] + 0.28) + 0.22, *thumb)
-        _draw_glimpse(axes, glimpse, rig.kinds[glimpse.record.camera_name])
+        _draw_glimpse(axes, glimpse, rig)
     top += heights["images"] + 0.2
     for number, (text, ink) in enumerate(lines):
         figure.text(0.3 / WIDTH, 1 - (top + 0.19 * number) / total, text, size=9, color=ink, va="center")
@@ -250,7 +279,8 @@ def legend_entries(rig: Rig) -> list[tuple[str, str]]:
     """Return the legend: each entry's text and colour."""
     names = {"train": "trained from", "other": "other cameras", "left out": "left out"}
     entries = [(names[kind], COLORS[kind]) for kind in COLORS if kind in rig.kinds.values()]
-    return entries + ([("what most see", VOLUME)] if rig.volume is not None else [])
+    entries += [("what most see", VOLUME)] if rig.volume is not None else []
+    return entries + ([(f"correction × {rig.magnification:,.0f}", ARROW)] if rig.ways else [])
 
 
 def _outside_view(rig: Rig) -> Camera:
@@ -346,15 +376,22 @@ def _draw_plan(axes: Any, rig: Rig) -> None:
     axes.set_axisbelow(True)
 
 
-def _draw_glimpse(axes: Any, glimpse: Glimpse, kind: str) -> None:
-    """Draw an image with the outline of its mask, under its name and exposure."""
-    pixels = display_pixels(glimpse)
+def _draw_glimpse(axes: Any, glimpse: Glimpse, rig: Rig) -> None:
+    """Draw an image with the outline of its mask and its camera's correction, under its name and exposure."""
+    pixels, name = display_pixels(glimpse), glimpse.record.camera_name
+    kind = rig.kinds[name]
     height, width = pixels.shape[:2]
     axes.imshow(pixels, interpolation="bilinear", extent=(0, width, height, 0))
     if glimpse.alpha is not None and glimpse.alpha.min() < 0.5 < glimpse.alpha.max():
         axes.contour(
             np.arange(width) + 0.5, np.arange(height) + 0.5, glimpse.alpha, levels=[0.5], colors=OUTLINE, linewidths=0.7
         )
+    if name in rig.ways:
+        way = rig.ways[name] * rig.magnification * width / rig.cameras[name].width
+        start = np.array([0.5 * width, 0.5 * height])
+        style = {"arrowstyle": "-|>", "color": ARROW, "lw": 1.4, "shrinkA": 0.0, "shrinkB": 0.0}
+        axes.annotate("", tuple(start + way), tuple(start), arrowprops=style, annotation_clip=False)
+    axes.text(0.03, 0.03, rig.correction(name), size=6.5, color="white", transform=axes.transAxes)
     axes.set_xlim(0, width)
     axes.set_ylim(height, 0)
     axes.set_xticks([])
@@ -362,7 +399,6 @@ def _draw_glimpse(axes: Any, glimpse: Glimpse, kind: str) -> None:
     for side in axes.spines.values():
         side.set_color(COLORS[kind])
         side.set_linewidth(1.0 if kind != "left out" else 2.5)
-    name = glimpse.record.camera_name
     axes.set_title(name if len(name) <= 18 else "…" + name[-17:], size=7, color=COLORS[kind], loc="left", pad=2)
     if glimpse.exposure is not None:
         axes.set_title(f"{glimpse.exposure:+.1f} EV", size=7, color=GREY, loc="right", pad=2)

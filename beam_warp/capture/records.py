@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beam_warp.capture.cutouts import taken_in
 from beam_warp.capture.lenses import Lens
 from beam_warp.capture.mattes import MaskOffset, keyed, matte
 from beam_warp.capture.undistort import COLORS, Intrinsics, Undistortion
@@ -76,6 +77,8 @@ class CaptureRecord:
         truth_path: An EXR of exact channels, if the capture is synthetic.
         relit_paths: Exact images under other lights, by the name of the light.
         undistortion: Undistortion of all files as they are read; None if a pinhole took them.
+        mask_excess: How far coverage reaches beyond the subject [pixel of `view`], which is taken in as it is read.
+        gains: Factors of red, green and blue that the camera is known to be off by; `view` undoes them.
     """
 
     camera_name: str
@@ -90,6 +93,8 @@ class CaptureRecord:
     truth_path: Path | None = None
     relit_paths: Mapping[str, Path] = field(default_factory=dict)
     undistortion: Undistortion | None = None
+    mask_excess: float = 0.0
+    gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def name(self) -> str:
@@ -152,7 +157,11 @@ class CaptureRecord:
                 f"image must be finite, got NaN or infinity in {int((~np.isfinite(rgba)).any(axis=-1).sum())} pixels "
                 f"at {self.image_path}. Export it again, or repair those pixels."
             )
-        return CapturedView(name=self.name, camera=self.camera, color=rgba[..., :3], alpha=alpha, mask_offset=offset)
+        color = rgba[..., :3]
+        if self.gains != (1.0, 1.0, 1.0):
+            color = color / np.array(self.gains, np.float32)
+        found = CapturedView(name=self.name, camera=self.camera, color=color, alpha=alpha, mask_offset=offset)
+        return taken_in(found, self.mask_excess)
 
     def truth(self) -> Image:
         """Read the exact channels, undistorted like the image.

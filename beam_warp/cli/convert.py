@@ -20,6 +20,7 @@ from beam_warp.cli.common.pages import parse
 from beam_warp.cli.common.paths import paths_checked
 from beam_warp.converters.common.importers import IMPORTERS
 from beam_warp.converters.common.options import Activation, MaterialActivation, Profile
+from beam_warp.converters.delivery.writer import delivered
 from beam_warp.converters.formats import FORMATS, format_of
 from beam_warp.converters.frame_files import written_axes
 from beam_warp.converters.numbering import holds_a_frame, numbered_path
@@ -77,6 +78,7 @@ class ConvertCommand:
     lighting_variants: Annotated[
         bool, arg(help="USD: add a variant whose radiance is the base colour, for renderers that light it.")
     ] = False
+    error_scale: Annotated[float, arg(metavar="X", help="b4d: multiply the bounds of all errors.")] = 1.0
     quiet: Quiet = False
     json: Json = False
 
@@ -114,6 +116,7 @@ def convert(command: ConvertCommand) -> int:
         spz_version=command.spz_version,
         full_float=command.full_float,
         lighting_variants=command.lighting_variants,
+        error_scale=command.error_scale,
     )
     converters.require_output(command.output, options)
     sequence = converters.read(
@@ -148,6 +151,8 @@ def convert(command: ConvertCommand) -> int:
         and first.base_color is not None
     ):
         notes.append("materials are left out: --profile beam keeps them in PLY and glTF")
+    elif form.name == "b4d" and (without := [name for name in first.arrays() if name not in delivered(first, options)]):
+        notes.append(f"what is not drawn and left out: {', '.join(without)}")
     axes = written_axes(command.output, options, form)
     if form.axes is not None and axes != form.axes:
         notes.append(f"{form.name} means {form.axes}; this file is in {axes} and states it, which few readers heed")

@@ -54,6 +54,7 @@ COMMANDS = {
     "stability": Command("Stability", "Run what tracing, reconstruction, materials and relighting may fail on."),
     "chart": Command("Chart", "Measure error against time on your own data and device."),
     "inspect": Command("Inspect", "Say what is wrong with a capture before hours are spent on it."),
+    "plates": Command("Plates", "Tell the subject by what moves, for a capture without masks."),
     "plan": Command("ShowPlan", "Say how far a long job is: frames done, running, left, failed, and an estimate."),
 }
 

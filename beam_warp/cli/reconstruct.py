@@ -13,6 +13,7 @@ from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
+from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
     from beam_warp.reconstruction.frames.protocols import FrameSteps
@@ -41,6 +42,16 @@ class Modelling:
         arg(help="Correct cameras that are beyond doubt wrong, or keep all as the capture states them."),
         SECOND_PAGE,
     ] = "refine"
+    masks: Annotated[
+        Literal["refine", "keep"],
+        arg(help="Move masks of cut-outs that are beyond doubt wrong, or keep all as they are."),
+        SECOND_PAGE,
+    ] = "refine"
+    exposures: Annotated[
+        Literal["match", "keep"],
+        arg(help="Match exposures and white balances that differ beyond chance, or keep all as photographed."),
+        SECOND_PAGE,
+    ] = "match"
     frames: Annotated[
         str | None, arg(metavar="A:B", help="Frames A to B - 1 of the capture; A:B:S takes every S-th of them.")
     ] = None
@@ -71,7 +82,8 @@ def reconstruct(args: Reconstruct) -> int:
     """Reconstruct and say what came out."""
     capture = Capture.read(args.capture)
     options = options_of(args.modelling, capture)
-    steps = steps_of(args.modelling, capture, args.seed, args.device)
+    light = None if capture.environment_path is None else EnvironmentMap.read(capture.environment_path)
+    steps = steps_of(args.modelling, capture, args.seed, args.device, light)
 
     from beam_warp.plan.crew import crew_of
     from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
@@ -102,8 +114,10 @@ def summary(report: dict[str, Any]) -> str:
     return ", ".join([*words, f"{report['seconds']:.1f} s on {report['device']['name']}"])
 
 
-def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | None) -> FrameSteps:
-    """Return the steps that the words ask for."""
+def steps_of(
+    modelling: Modelling, capture: Capture, seed: int, device: str | None, environment: EnvironmentMap | None
+) -> FrameSteps:
+    """Return the steps that the words ask for, under a light that is known or not."""
     from beam_warp.reconstruction.fit import FitOptions
     from beam_warp.reconstruction.steps import FitAndTrack
     from beam_warp.reconstruction.track import TrackOptions
@@ -116,6 +130,7 @@ def steps_of(modelling: Modelling, capture: Capture, seed: int, device: str | No
         fitting=FitOptions.of_preset(modelling.preset, **asked),
         tracking=replace(tracking, refinement=replace(tracking.refinement, seed=seed)),
         points=capture.points(),
+        environment=environment,
         device=device,
     )
 
@@ -125,7 +140,13 @@ def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
     from beam_warp.reconstruction.job import ReconstructOptions
 
     frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
-    return ReconstructOptions(segment_length=modelling.segment_length, frames=frames, cameras=modelling.cameras)
+    return ReconstructOptions(
+        segment_length=modelling.segment_length,
+        frames=frames,
+        cameras=modelling.cameras,
+        masks=modelling.masks,
+        exposures=modelling.exposures,
+    )
 
 
 def frames_of(words: str, there: tuple[int, ...]) -> tuple[int, ...]:

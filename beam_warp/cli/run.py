@@ -87,7 +87,7 @@ def run(args: Run) -> int:
             work = MaterialWork(require_path("out", args.out), given, environment, options, report)
             result, reconstruction = run_materials(work, view, started, crew), None
         else:
-            frames = _frame_work(args, capture)
+            frames = _frame_work(args, capture, environment)
             work = MaterialWork(args.out, ReconstructedFrames(frames, args.fps), environment, options, report)
             both = run_capture(frames, work, view, started, crew)
             result, reconstruction = both.result, both.reconstruction.report
@@ -118,8 +118,8 @@ def _check_words(args: Run, capture: Capture | None) -> None:
     """Refuse words that do not go with the input."""
     if capture is None and args.modelling != Modelling():
         raise InvalidOptionError(
-            "gaussians, target-psnr, preset, segment-length, cameras and frames must be left out unless the input is a "
-            f"capture, got {args.input}. Drop them."
+            "gaussians, target-psnr, preset, segment-length, cameras, masks, exposures and frames must be left out "
+            f"unless the input is a capture, got {args.input}. Drop them."
         )
     of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)
     if capture is not None and any(value is not None for value in of_files):
@@ -137,11 +137,11 @@ def _read(args: Run) -> GaussianSequence:
     return sequence if args.fps is None else replace(sequence, frames_per_second=args.fps)
 
 
-def _frame_work(args: Run, capture: Capture) -> ReconstructionWork:
+def _frame_work(args: Run, capture: Capture, environment: EnvironmentMap) -> ReconstructionWork:
     from beam_warp.jobs.store import make_folders
     from beam_warp.reconstruction.job import ReconstructionWork
 
-    steps = steps_of(args.modelling, capture, args.seed, args.device)
+    steps = steps_of(args.modelling, capture, args.seed, args.device, environment)
     options = options_of(args.modelling, capture)
     make_folders(args.out)
     return ReconstructionWork.prepare(capture, args.out / "reconstruction", steps, options)

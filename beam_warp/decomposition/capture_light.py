@@ -62,12 +62,28 @@ class CaptureLight:
         turned = environment.rotated(turned_by) if turned_by else environment
         with source.log.timer("prepare light"):
             prepared = PreparedEnvironment(turned, source.device).scaled(2.0**stops)
-        turn = LightTurn(degrees, error)
-        return cls(turned.scaled(2.0**stops), prepared, stops, bool(is_fitted), turn, turned_by, (low, high))
+        turn, scales = LightTurn(degrees, error), (low * 2.0**stops, high * 2.0**stops)
+        return cls(turned.scaled(2.0**stops), prepared, stops, bool(is_fitted), turn, turned_by, scales)
 
     @property
     def findings(self) -> list[Finding]:
-        """What is to be said about a light that is askew."""
+        """What is to be said about a light that is askew, and about its scale."""
+        return self._askew() + self._scale()
+
+    def _scale(self) -> list[Finding]:
+        """Return a note on how far base colours are known; none where nothing was asked."""
+        if not np.isfinite(self.scales).all():
+            return []
+        least, most = self.scales
+        what = (
+            "the scale of the light is as stated, and nothing in the images checks it closely: under a brighter or "
+            f"dimmer one, base colours would be {least:.2g} to {most:.2g} times as bright"
+        )
+        remedy = "Base colours are as sure as the light's exposure: a grey card in the images would check it."
+        return [Finding("note", "base-color-scale", what, remedy=remedy)]
+
+    def _askew(self) -> list[Finding]:
+        """Return a warning about a light that is turned."""
         if not self.turn.is_certain:
             return []
         done, remedy = "it was turned by that", "Keep it as it is by --no-turn-light, if it was measured better."

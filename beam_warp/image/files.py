@@ -189,6 +189,30 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         return picture.size
 
 
+def quantization_error(path: str | os.PathLike[str]) -> float:
+    """Return how far a JPEG's luminance may be from what was photographed, from its header [level of 255].
+
+    A coefficient that is rounded to steps of q is off by up to q / sqrt(12), root mean square; of a texture that is
+    finer than its steps all coefficients are. The transform is orthonormal, so that pixels are off by as much.
+
+    Returns:
+        The root mean square over coefficients; 0 for files of other formats.
+
+    Raises:
+        MissingFileError: There is no such file, or it cannot be read.
+        AssetFormatError: The header is not that of an image that `read_image` reads.
+
+    Source: ITU-T T.81, Annex A.3.
+    """
+    path = require_path("path", path)
+    _require_file(path)
+    if path.suffix.lower() not in (".jpg", ".jpeg"):
+        return 0.0
+    with _picture(path) as picture:
+        steps = getattr(picture, "quantization", {}).get(0, ())
+        return float(np.sqrt(np.mean(np.square(steps, dtype=np.float64)) / 12.0)) if len(steps) else 0.0
+
+
 def _require_file(path: Path) -> None:
     if path.suffix.lower() not in SUFFIXES:
         raise AssetFormatError(

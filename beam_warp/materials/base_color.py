@@ -78,9 +78,10 @@ def solve_base_color(
 ) -> BaseColor:
     """Solve the least-squares problem that the frames add up to.
 
-    rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins two independent parts: how
-    badly one rho explains all views and frames, and the error of the light: its noise and that of the normal it
-    falls on, averaged over frames. Where nothing at all was measured, all are `UNKNOWN`.
+    rho = sum w L_D (L_o - L_S) / sum w L_D^2, cut to [0, 1]. The standard error joins three independent parts: how
+    badly one rho explains all views and frames; the error of the light, its noise and that of the normal it falls on,
+    averaged over frames; and how far the Gaussians are from the images, which more views do not mend: what they cannot
+    show of radiance they cannot show of base colour. Where nothing at all was measured, all are `UNKNOWN`.
 
     Args:
         cloud: The Gaussians, of any one of the frames, with the confidence of their normals.
@@ -94,7 +95,8 @@ def solve_base_color(
     flags = observability(cloud, evidence, mean_irradiance)
     missing = ((flags & np.uint8(MISSING)) != 0) | ~_has_evidence(evidence)
     raw, error = least_squares(evidence)
-    base_color, error = np.clip(raw, 0.0, 1.0), error * np.sqrt(dispersion)
+    base_color = np.clip(raw, 0.0, 1.0)
+    error = np.hypot(error * np.sqrt(dispersion), misfit_error(evidence))
     weight = np.where(missing, 0.0, cloud.opacities)
     clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
     base_color, error = fill_from_neighbors(cloud.positions, base_color, error, missing)
@@ -131,6 +133,15 @@ def least_squares(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray
     # rho = L_o / (E d) - s / d for light E times shares d and s: an error of E moves it by (rho + s / d) / E
     light = (bounded + SPECULAR_PART) ** 2 * noise[:, None]
     return raw, np.where(known, np.sqrt(variance + light), 0.0)
+
+
+def misfit_error(evidence: ColorEvidence) -> NDArray[np.float64]:
+    """Return by how much base colour is off where images and Gaussians differ, root mean square, ``(N, 3)``.
+
+    At most as much as any base colour can be.
+    """
+    squares = np.asarray(evidence.misfit, np.float64) / measured_frames(evidence)[:, None]
+    return np.minimum(np.sqrt(squares), 1.0)
 
 
 def measured_frames(evidence: ColorEvidence) -> NDArray[np.float64]:

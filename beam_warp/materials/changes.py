@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from beam_warp.materials.base_color import BaseColor, least_squares
+from beam_warp.materials.base_color import BaseColor, least_squares, misfit_error
 from beam_warp.materials.direct import ColorEvidence
 
 FALSE_DISCOVERIES = 1e-3
@@ -110,6 +110,7 @@ def with_changes(constant: BaseColor, change: ColorChange, evidence: ColorEviden
         return constant
     rows = change.changing[:, None]
     color, error = change.frame_color(evidence)
+    error = np.hypot(error, misfit_error(evidence))
     return replace(
         constant,
         base_color=np.where(rows, np.clip(color, 0.0, 1.0), constant.base_color).astype(np.float32),

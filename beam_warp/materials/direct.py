@@ -121,6 +121,8 @@ class ColorEvidence:
         irradiance: Sum over frames of the irradiance that arrives from the environment, ``(N, 3)``.
         openness: Sum over frames of the hemispherical visibility, ``(N,)``.
         noise: Sum over frames of the squared relative standard error of the arriving light, ``(N,)``.
+        misfit: Sum over frames of the mean square of what images differ by from what the Gaussians show, over the
+            square of the arriving light: in units of base colour, ``(N, 3)``.
         views: How many equally good views the weights are worth, ``(N,)``.
         facing: Sum over frames of the part of what was seen that was not seen grazing, ``(N,)``.
         saturated: Sum over frames of the part of what was seen that was cut at a ceiling, ``(N,)``.
@@ -134,6 +136,7 @@ class ColorEvidence:
     irradiance: NDArray[Any]
     openness: NDArray[Any]
     noise: NDArray[Any]
+    misfit: NDArray[Any]
     views: NDArray[Any]
     facing: NDArray[Any]
     saturated: NDArray[Any]
@@ -269,7 +272,12 @@ def measure_materials(
         whole[at_rows] = values
         return whole[chosen]
 
-    tilt = measured.light.tilt.numpy() * points.normal_error[lit]
+    # The normal is a mean over views, whose errors have little in common.
+    tilt = measured.light.tilt.numpy() * points.normal_error[lit] / np.sqrt(np.maximum(fit.views.numpy(), 1.0))
+    arriving = measured.light.arriving.numpy() + measured.light.bounce.numpy()
+    misfit = np.zeros_like(arriving)
+    if views is not None:
+        np.divide(views.misfit[lit], arriving**2, out=misfit, where=arriving > 0.0)
     evidence = ColorEvidence(
         numerator=by_row(fit.numerator.numpy(), lit),
         denominator=by_row(fit.denominator.numpy(), lit),
@@ -277,6 +285,7 @@ def measure_materials(
         irradiance=by_row(np.pi * measured.light.arriving.numpy(), lit),
         openness=by_row(visibility, shown),
         noise=by_row(measured.light.noise.numpy() ** 2 + tilt**2, lit),
+        misfit=by_row(misfit, lit),
         views=by_row(fit.views.numpy(), lit),
         facing=by_row(fit.facing.numpy(), lit),
         saturated=(_cut_radiance(cloud) if views is None else views.saturated)[chosen],

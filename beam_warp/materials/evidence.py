@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from beam_warp.capture.quality import WHOLE, photon_noise
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
@@ -40,7 +41,7 @@ from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
-SURFACE_CHANNELS = 8
+SURFACE_CHANNELS = 11
 """Number of a pixel's channels that are added up over views."""
 
 LEAST_WEIGHT = 0.5
@@ -83,6 +84,8 @@ class ViewEvidence:
         colors: Scene-linear radiance towards each camera and its weight [pixel], ``(V, N)`` vec4; of no views if there
             were no images.
         directions: Unit, towards each camera, ``(V, N)`` vec3.
+        misfit: Mean square of what images differ by from what the Gaussians show, less what their noise makes it, over
+            the pixels with an image that show each one, ``(N, 3)`` float32 on the host; 0 where there is none.
     """
 
     positions: wp.array
@@ -93,6 +96,7 @@ class ViewEvidence:
     saturated: NDArray[np.float32]
     colors: wp.array
     directions: wp.array
+    misfit: NDArray[np.float32]
 
 
 def view_evidence(
@@ -186,7 +190,10 @@ def view_evidence(
         target,
     )
     saturated = np.divide(cut, weight, out=np.zeros_like(cut), where=weight > 0.0)
-    return ViewEvidence(positions, normals, agreement, weight, seen, saturated, colors, directions)
+    with_image = colors.numpy()[..., 3].sum(axis=0)[:, None]
+    misfit = np.divide(totals[:, 8:], with_image, out=np.zeros_like(totals[:, 8:]), where=with_image > 0.0)
+    misfit = np.maximum(misfit, 0.0)
+    return ViewEvidence(positions, normals, agreement, weight, seen, saturated, colors, directions, misfit)
 
 
 def _groups(
@@ -279,6 +286,12 @@ def _coverage(cloud: GaussianCloud, cameras: Sequence[Camera], center: NDArray[n
     return np.pi * density * cloud.opacities * larger
 
 
+def _noise(image: CapturedView) -> float:
+    """Return the variance of a pixel over its value; 0 where nothing tells."""
+    solid = np.ones(image.color.shape[:2], bool) if image.alpha is None else image.alpha > WHOLE
+    return float(np.nan_to_num(photon_noise(image.color, solid)))
+
+
 def _captured(image: CapturedView | None, ceiling: float, device: wp.Device) -> CapturedPixels:
     """Bring an image to the device."""
     captured = CapturedPixels()
@@ -287,4 +300,5 @@ def _captured(image: CapturedView | None, ceiling: float, device: wp.Device) -> 
     captured.color = upload(color, wp.vec3, device)
     captured.coverage = upload(coverage, float, device)
     captured.ceiling = HEADROOM * ceiling
+    captured.noise = 0.0 if image is None else _noise(image)
     return captured

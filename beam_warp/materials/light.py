@@ -30,13 +30,13 @@ from beam_warp.materials.light_fits import (
     turned_lights,
     well_shown,
 )
-from beam_warp.materials.light_turn import weaker_explains
+from beam_warp.materials.light_turn import missing_light, turned_cells, weaker_explains
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import visibility
 from beam_warp.world.environment import EnvironmentMap
 
-ASKED = 1024
+ASKED = 2048
 """Most Gaussians to ask, spread evenly over the cloud."""
 
 MOST_VIEWS = 12
@@ -196,10 +196,20 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
         exposure_stops=_exposure_stops(mean_colors(shown), irradiance_over_pi(shown, lights[best])),
         point_count=count,
     )
-    is_unlike = all(fits.clearly(EVEN, way) > 1.0 or weaker_explains(shown, lights[way]) > 1.0 for way in (here, there))
+    is_unlike = all(_is_unlike(shown, fits, way, lights[way], environment) for way in (here, there))
     ways = [best] if fits.clearly(best, other) > 1.0 else [best, other]
     told = [f"{'mirrored and ' if way >= LIGHT_COLUMNS else ''}turned by {_refined(fits, way):+.0f}" for way in ways]
     return replace(check, findings=tuple(_findings(check, is_unlike, " degrees, or ".join(told))))
+
+
+def _is_unlike(
+    shown: LightEvidence, fits: LightFits, way: int, cells: NDArray[np.float64], environment: EnvironmentMap
+) -> bool:
+    """Return whether a light, at its best turn, leaves shading between neighbours that another light explains."""
+    if fits.clearly(EVEN, way) > 1.0 or weaker_explains(shown, cells) > 1.0:
+        return True
+    light = EnvironmentMap(environment.radiance[:, ::-1].copy()) if way >= LIGHT_COLUMNS else environment
+    return missing_light(shown, turned_cells(light, np.array([_refined(fits, way)]))[:, 0]).is_certain
 
 
 def possible_scales(evidence: LightEvidence, environment: EnvironmentMap) -> tuple[float, float]:
@@ -288,7 +298,7 @@ def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
 
     Args:
         check: What was found.
-        is_unlike: Whether a light of less contrast explains the capture better than any turn.
+        is_unlike: Whether a light of another kind explains the capture better than any turn.
         told: The turns that explain it best, in words, without the unit of the last.
     """
     if is_unlike:
@@ -296,9 +306,9 @@ def _findings(check: LightCheck, is_unlike: bool, told: str) -> list[Finding]:
             Finding(
                 "warning",
                 "environment-unexplained",
-                "environment does not explain the capture under any turn: a light of less contrast explains it better, "
-                f"and one that is the same from all sides leaves a spread of base colours of {check.spread_even:.2f}, "
-                f"this one {check.spread_best:.2f}",
+                "environment does not explain the capture under any turn: another light leaves less shading between "
+                f"neighbours, whose base colours differ by {check.spread_best:.2f} under this one and by "
+                f"{check.spread_even:.2f} under one that is the same from all sides",
                 remedy="Check that it is the light of this capture.",
             )
         ]

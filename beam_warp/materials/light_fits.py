@@ -14,6 +14,7 @@ jackknife, Efron and Stein 1981.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,9 @@ CHANCE = 0.05
 
 LEAST_GAIN = 0.01
 """Difference of misfit that matters: a light that explains a capture 1 % better is as good."""
+
+VIEW_THREADS = 8
+"""Views whose highlights are worked out at a time."""
 
 GLOSSY_PART = 0.01
 """Change of luminance from view to view, of what is seen, above which gloss can be told from noise: 0.07 to 0.09 in
@@ -165,11 +169,11 @@ def _by_block(values: NDArray[np.floating], blocks: NDArray[np.int64]) -> NDArra
     return sums
 
 
-def parts_of(positions: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return which part of the surface each point belongs to, ``(M,)``: at most `BLOCKS`, none of them small."""
+def parts_of(positions: NDArray[np.float32], most: int = BLOCKS) -> NDArray[np.int64]:
+    """Return which part of the surface each point belongs to, ``(M,)``: at most ``most``, none of them small."""
     tree = cKDTree(positions)
     blocks = np.zeros(tree.n, np.int64)
-    for number, rows in enumerate(np.array_split(tree.indices, max(1, min(BLOCKS, tree.n // LEAST_IN_BLOCK)))):
+    for number, rows in enumerate(np.array_split(tree.indices, max(1, min(most, tree.n // LEAST_IN_BLOCK)))):
         blocks[rows] = number
     return blocks
 
@@ -190,16 +194,21 @@ def neighbor_differences(
     Returns:
         Sums ``(B, K)`` and counts ``(B, 1)``.
     """
+    first, second = neighbor_pairs(shown, count)
+    apart = np.zeros((int(blocks.max()) + 1, base.shape[1]))
+    for light in range(base.shape[1]):
+        apart[:, light] = np.bincount(blocks[first], np.abs(base[first, light] - base[second, light]), len(apart))
+    return apart, np.bincount(blocks[first], minlength=len(apart)).astype(np.float64)[:, None]
+
+
+def neighbor_pairs(shown: LightEvidence, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return pairs of neighbours that do not face away from each other, each once: rows of the one and the other."""
     tree, normals = cKDTree(shown.positions), shown.normals
     _, near = tree.query(tree.data, k=min(count + 1, tree.n))
     pairs = np.stack([np.repeat(np.arange(tree.n), near.shape[1]), near.reshape(-1)], axis=1)
     first, second = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0).T
     facing = (normals[first] * normals[second]).sum(axis=1) > 0.0
-    first, second = first[facing], second[facing]
-    apart = np.zeros((int(blocks.max()) + 1, base.shape[1]))
-    for light in range(base.shape[1]):
-        apart[:, light] = np.bincount(blocks[first], np.abs(base[first, light] - base[second, light]), len(apart))
-    return apart, np.bincount(blocks[first], minlength=len(apart)).astype(np.float64)[:, None]
+    return first[facing], second[facing]
 
 
 def well_shown(evidence: LightEvidence) -> LightEvidence:
@@ -247,32 +256,45 @@ def cell_angles() -> NDArray[np.float32]:
     return np.repeat(rows, LIGHT_COLUMNS).astype(np.float32)
 
 
-def _mirrored(
-    normals: NDArray[np.float32],
-    openness: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    lights: NDArray[np.float64],
-    roughness: float,
-) -> NDArray[np.float32]:
-    """Return the luminance that points mirror towards views, under each light, ``(V, M, lights)``; GGX, F0 = 0.04."""
+def mirrored(shown: LightEvidence, lights: NDArray[np.float64], roughness: float) -> NDArray[np.float32]:
+    """Return the luminance that points mirror towards views under each light, ``(V, M, lights)``; GGX, n = 1.5.
+
+    What hides the light is mirrored too, with the mean colour of all points.
+    """
     cells = cell_directions()
     by_light = (lights @ LUMINANCE).T.astype(np.float32)
-    reach = np.maximum(normals @ cells.T, 0.0)
-    power = np.float32(roughness**4)
-    result = np.empty((len(directions), len(normals), len(lights)), np.float32)
-    for view, toward in enumerate(directions):
+    hidden = np.float32(mean_colors(shown).mean(axis=0) @ LUMINANCE)
+    reach = np.maximum(shown.normals @ cells.T, 0.0)
+    angles, power = cell_angles(), np.float32(roughness**4)
+    result = np.zeros((len(shown.directions), len(reach), len(lights)), np.float32)
+
+    def show(view: int) -> None:
+        rows = np.flatnonzero(shown.weights[view] > 0.0)
+        toward, arriving, openness = shown.directions[view, rows], reach[rows], shown.openness[rows]
         # |v + l|² = 2 + 2 v.l, so that no half vector is formed
         double = np.sqrt(np.maximum(2.0 + 2.0 * (toward @ cells.T), 1e-6))
-        cosine = np.maximum(np.einsum("mk,mk->m", normals, toward), 0.05)[:, None]
-        n_h = (cosine + reach) / double
-        fresnel = 0.04 + 0.96 * (1.0 - np.clip(0.5 * double, 0.0, 1.0)) ** 5
+        cosine = np.maximum(np.einsum("mk,mk->m", shown.normals[rows], toward), 0.05)[:, None]
+        n_h = np.minimum((cosine + arriving) / double, 1.0)
         lobe = power / (np.pi * (n_h * n_h * (power - 1.0) + 1.0) ** 2)
         masking = 0.5 / (
-            reach * np.sqrt(cosine**2 * (1.0 - power) + power) + cosine * np.sqrt(reach**2 * (1.0 - power) + power)
+            arriving * np.sqrt(cosine**2 * (1.0 - power) + power)
+            + cosine * np.sqrt(arriving**2 * (1.0 - power) + power)
         )
-        transfer = lobe * masking * fresnel * reach * openness * cell_angles()
-        result[view] = transfer.astype(np.float32) @ by_light
+        transfer = lobe * masking * dielectric_fresnel(np.minimum(0.5 * double, 1.0)) * arriving * angles
+        result[view, rows] = (transfer * openness) @ by_light
+        result[view, rows] += hidden * (transfer * (1.0 - openness)).sum(axis=1)[:, None]
+
+    with ThreadPoolExecutor(VIEW_THREADS) as pool:
+        list(pool.map(show, range(len(result))))
     return result
+
+
+def dielectric_fresnel(cosine: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the part of unpolarised light that a surface of index 1.5 reflects, by the cosine of incidence."""
+    inner = np.sqrt(cosine * cosine + np.float32(1.25))
+    across = (inner - cosine) / (inner + cosine)
+    along = (cosine * (inner + cosine) - 1.0) / (cosine * (inner - cosine) + 1.0)
+    return 0.5 * across**2 * (1.0 + along**2)
 
 
 def _base_colors(shown: LightEvidence, lights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -300,9 +322,9 @@ def glossy_sums(
     seen = _by_block((weights * found**2).sum(axis=0)[:, None], blocks)
     sums = np.zeros((2, len(seen), len(lights)))
     if seen.sum() > GLOSSY_PART**2 * float(weights.sum()):
-        mirrored = _mirrored(shown.normals, shown.openness, shown.directions, lights, roughness)
+        reflected = mirrored(shown, lights, roughness)
         for index in range(len(lights)):
-            expected = changes(mirrored[..., index])
+            expected = changes(reflected[..., index])
             both = np.stack([(weights * expected * found).sum(axis=0), (weights * expected**2).sum(axis=0)], axis=1)
             sums[..., index] = _by_block(both, blocks).T
     return sums[0], sums[1], seen

@@ -6,8 +6,10 @@ from leaving out one part of the surface after the other. What hides the sky sen
 the turn of a walking figure is off by two to four degrees, because the sides of its limbs that face each other are
 brighter than the sky alone makes them.
 
-Changes from view to view tell the turn of the same figures three times less well than shading does, and are left out;
-tilts about level axes are as uncertain, and are not looked for.
+Changes from view to view tell the turn of the same figures less well than shading does, because their places depend on
+the roughness that is assumed, and are left out; tilts about level axes are as uncertain, and are not looked for.
+
+A light that no turn mends is that of another place. What such a light lacks changes smoothly with the normal.
 
 Source: see `beam_warp.materials.light_fits`; the jackknife, Efron and Stein 1981.
 """
@@ -27,11 +29,13 @@ from beam_warp.materials.light_fits import (
     LEAST_VIEWS,
     LIGHT_COLUMNS,
     LIGHT_ROWS,
+    NEIGHBORS,
     LightEvidence,
     cell_angles,
     cell_directions,
     mean_colors,
     neighbor_differences,
+    neighbor_pairs,
     parts_of,
     well_shown,
 )
@@ -64,6 +68,20 @@ are off by up to three."""
 
 LARGEST_TURN = 10.0
 """Turn up to which a light is taken to be mounted askew [degree]; beyond, it follows another convention."""
+
+LEAST_EXPLAINED = 0.02
+LEAST_MISSING = 0.15
+"""Gain and size from which on a smooth missing light means that the stated one is that of another place. The right
+light gains up to 0.01 and its harmonics have a size of up to 0.08; of others, up to 0.14 and 0.6."""
+
+MOST_ALIKE = 0.8
+"""Part of normals that places may tell: all on a ball, half or less on figures."""
+
+ROUNDS = 8
+SMALLEST_DIFFERENCE = 0.02
+PULL = 1e-3
+"""Rounds of reweighting to least absolute errors, difference of logarithms below which all count alike, and pull
+towards no correction, in parts of the evidence."""
 
 LEAST_COLOR = 1e-3
 LEAST_LIGHT = 0.01
@@ -138,6 +156,95 @@ def turned_cells(environment: EnvironmentMap, degrees: NDArray[np.float64]) -> N
         shares[turn, column, near.astype(np.int64) % LIGHT_COLUMNS] = share
     cells = np.einsum("rfc,tfk->rktc", power, shares, optimize=True)
     return cells.reshape(LIGHT_ROWS * LIGHT_COLUMNS, len(degrees), 3).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class MissingLight:
+    """Smooth light beside a stated one that explains differences between neighbours.
+
+    Attributes:
+        gain: Logarithm of neighbours' differences without it over those with it, smooth paint taken out of both.
+        gain_error: Standard error of the same.
+        size: Standard deviation over the points of its logarithm, of irradiance.
+    """
+
+    gain: float
+    gain_error: float
+    size: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the stated light lacks so much, beyond doubt, that it is another one."""
+        return self.size > LEAST_MISSING and self.gain > max(LEAST_EXPLAINED, CERTAIN * self.gain_error)
+
+
+def missing_light(shown: LightEvidence, cells: NDArray[np.float32]) -> MissingLight:
+    """Find the smooth light that explains most of neighbours' differences.
+
+    Whatever light is missing or wrong, irradiance changes smoothly with the normal: its ratio to the stated one is
+    fitted by harmonics up to the second degree. Under the right light nothing is left for them to explain. What places
+    explain, up to the second degree, may be paint: on a ball that is all, and nothing is known. Each part of the
+    surface is explained by what the others give, so that what is fitted to chance explains nothing.
+
+    Args:
+        shown: Well-shown points, at least `LEAST_POINTS`.
+        cells: Irradiance that each cell sends [W/m²], ``(L, 3)``.
+
+    Source: nine harmonics hold all but a few percent of irradiance, Ramamoorthi and Hanrahan 2001.
+    """
+    parts = parts_of(shown.positions)
+    first, second = neighbor_pairs(shown, NEIGHBORS)
+    base = (shown_colors(shown) - log_irradiance(shown, cells[:, None])[:, 0]).mean(axis=1)
+    places = shown.positions.astype(np.float64) - shown.positions.mean(axis=0)
+    of_places = _harmonics(places / max(float(places.std()), 1e-12), squares=3)
+    of_normals = _harmonics(shown.normals.astype(np.float64))
+    if _alike(of_places, of_normals) > MOST_ALIKE:
+        return MissingLight(0.0, float("inf"), 0.0)
+    differences, groups = base[first] - base[second], parts[first]
+
+    def fitted(smooth: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        terms = smooth[first] - smooth[second]
+        whole, others = _fitted(differences, terms, groups)
+        left = np.abs(differences - (terms * others[groups]).sum(axis=1))
+        return whole, np.bincount(groups, left, parts.max() + 1).astype(np.float64)
+
+    before = fitted(of_places)[1]
+    whole, after = fitted(np.hstack([of_places, of_normals]))
+    left_out = np.log((before.sum() - before) / np.maximum(after.sum() - after, 1e-12))
+    error = float(np.sqrt((len(left_out) - 1) * left_out.var()))
+    size = float((of_normals @ whole[of_places.shape[1] :]).std())
+    return MissingLight(float(np.log(before.sum() / max(after.sum(), 1e-12))), error, size)
+
+
+def _harmonics(vectors: NDArray[np.float64], *, squares: int = 2) -> NDArray[np.float64]:
+    """Return polynomials of the first and second degree, ``(M, 6 + squares)``; of unit vectors, two squares are all."""
+    x, y, z = vectors.T
+    return np.stack([x, y, z, x * y, y * z, z * x, x * x, y * y, z * z][: 6 + squares], axis=1)
+
+
+def _alike(places: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    """Return which part of the variance of the one, ``(M, K)``, the other explains."""
+    terms = np.hstack([np.ones((len(places), 1)), places])
+    left = normals - terms @ np.linalg.lstsq(terms, normals)[0]
+    return 1.0 - float(left.var(axis=0).sum() / max(float(normals.var(axis=0).sum()), 1e-12))
+
+
+def _fitted(
+    differences: NDArray[np.float64], terms: NDArray[np.float64], groups: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fit differences ``(P,)`` in least absolute errors: factors of all, ``(K,)``, and of all but each group."""
+    pull, whole = PULL * np.square(terms).sum(axis=0).mean() * np.eye(terms.shape[1]), np.zeros(terms.shape[1])
+    weights = np.ones(len(differences))
+    for _ in range(ROUNDS):
+        weighted = terms * weights[:, None]
+        whole = np.linalg.solve(weighted.T @ terms + weights.mean() * pull, weighted.T @ differences)
+        weights = 1.0 / np.maximum(np.abs(differences - terms @ whole), SMALLEST_DIFFERENCE)
+    weighted = terms * weights[:, None]
+    rows = [np.flatnonzero(groups == group) for group in range(int(groups.max()) + 1)]
+    squares = np.stack([weighted[some].T @ terms[some] for some in rows])
+    products = np.stack([weighted[some].T @ differences[some] for some in rows])[..., None]
+    left = squares.sum(axis=0) - squares + weights.mean() * pull
+    return whole, np.linalg.solve(left, products.sum(axis=0) - products)[..., 0]
 
 
 def weaker_explains(shown: LightEvidence, light: NDArray[np.float64]) -> float:

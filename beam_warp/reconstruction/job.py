@@ -6,7 +6,9 @@ other: several processes may work on them, and what tracking loses, the next key
 tracking is lost becomes a key frame itself.
 
     plan            frames.plan     the records of each frame, and the segments
+    masks           steps.mend_masks   how far cut-outs are off, from the first frame; corrected records
     cameras         steps.refine_rig   what is wrong with the rig, from its first frame; corrected records
+    exposures       steps.find_exposures  exposures and white balances of the rig, likewise
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
@@ -32,8 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp import converters
+from beam_warp.capture import corrections, exposures, mask_corrections
 from beam_warp.capture.capture import Capture, CaptureRecord
-from beam_warp.capture.corrections import FILE_NAME, read_corrections
+from beam_warp.capture.corrections import read_corrections
+from beam_warp.capture.exposures import read_exposures
+from beam_warp.capture.findings import Finding
+from beam_warp.capture.mask_corrections import read_mask_corrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
@@ -53,6 +59,7 @@ from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
 from beam_warp.reconstruction.frames.store import FrameStore, common_inputs, stored_cloud, stored_sequence
 from beam_warp.reconstruction.preview import mesh_shadings, opposite_cameras, reconstruction_preview
+from beam_warp.reconstruction.rig import FEWEST_CAMERAS
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
@@ -62,23 +69,31 @@ ASSET_NAME = "gaussians.usda"
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
-    """Options of a reconstruction: its frames, and where key frames are planned.
+    """Options of a reconstruction: its frames, where key frames are planned, and what of the capture is mended.
 
     Attributes:
         segment_length: Frames from one key frame to the next; 0 for a key frame at the start only.
         frames: Numbers of the frames, ascending; None for all of the split.
         cameras: ``"refine"`` corrects cameras that are beyond doubt wrong, the same in all frames; ``"keep"`` takes all
             as the capture states them.
+        masks: ``"refine"`` moves masks of cut-outs that are beyond doubt wrong, those of a camera the same in all
+            frames; ``"keep"`` takes all as they are.
+        exposures: ``"match"`` undoes differences of exposure and white balance between cameras that are beyond doubt,
+            the same in all frames; ``"keep"`` takes all colours as photographed.
     """
 
     segment_length: int = 0
     frames: tuple[int, ...] | None = None
     cameras: Literal["refine", "keep"] = "refine"
+    masks: Literal["refine", "keep"] = "refine"
+    exposures: Literal["match", "keep"] = "match"
 
     def __post_init__(self) -> None:
         """Check every field once."""
         require_count("segment_length", self.segment_length, low=0)
-        require_choice("cameras", self.cameras, ("refine", "keep"))
+        for name in ("cameras", "masks"):
+            require_choice(name, getattr(self, name), ("refine", "keep"))
+        require_choice("exposures", self.exposures, ("match", "keep"))
         if self.frames is not None and list(self.frames) != sorted(set(self.frames)):
             raise InvalidOptionError(
                 f"frames must be ascending and each there once, got {str(self.frames)[:60]}. Sort them."
@@ -116,7 +131,7 @@ class Reconstruction:
         asset: Root layer of the asset.
         sequence: The Gaussians, read lazily from the store; axes "rfu", scene-linear radiance.
         report: What was measured, JSON-able; also written to ``report.json``.
-        capture: The capture with the cameras that the Gaussians were fitted with.
+        capture: The capture with the cameras, masks and colours that the Gaussians were fitted to.
     """
 
     asset: Path
@@ -368,12 +383,22 @@ class ReconstructionWork:
         write_report(self.folder, report)
         return Reconstruction(self.folder / ASSET_NAME, sequence, report, self.seen())
 
+    def _findings(self) -> list[Finding]:
+        """Return what a user should know about the capture."""
+        said = list(self.frames.findings)
+        for mend in MENDS:
+            if mend.stage in self.found:
+                said += self.found[mend.stage].findings()
+            elif mend.stage == "cameras" and self.options.cameras == "refine":
+                said.append(_why_kept(self.frames.records))
+        return said
+
     def _report(self, receipts: Mapping[str, Receipt]) -> dict[str, Any]:
         """Return what was done and found, JSON-able."""
         records = self.records
         made = {frame: receipts[frame_step(frame)] for frame in records}
         frames = [{**self.store.report(frame), "seconds": receipt.seconds} for frame, receipt in made.items()]
-        findings = [*self.frames.findings, *(said for found in self.found.values() for said in found.findings())]
+        findings = self._findings()
         return {
             "input": {
                 "capture": str(self.capture.folder),
@@ -390,6 +415,7 @@ class ReconstructionWork:
             },
             "resumed_frames": sum(receipt.is_kept for receipt in made.values()),
             **{mend.stage: self.found[mend.stage].as_dict() if mend.stage in self.found else None for mend in MENDS},
+            "masks": self.found["masks"].as_dict()["cameras"] if "masks" in self.found else {},
             **sequence_facts(frames),
             "findings": [vars(finding) for finding in findings],
             "warnings": [*self.notes, *(finding.what for finding in findings), *warnings_of(frames)],
@@ -399,6 +425,20 @@ class ReconstructionWork:
 def frame_step(frame: int) -> str:
     """Return the name of the step that finds the Gaussians of a frame."""
     return f"frame-{frame:06d}"
+
+
+def _why_kept(records: Mapping[int, Sequence[CaptureRecord]]) -> Finding:
+    """Say why nothing is known about the cameras of a capture."""
+    count = len(next(iter(records.values())))
+    if not _is_fixed_rig(records):
+        why = "they move, or several have one name"
+    elif count < FEWEST_CAMERAS:
+        why = (
+            f"{FEWEST_CAMERAS} are needed to tell which one is wrong, and there {'is' if count == 1 else 'are'} {count}"
+        )
+    else:
+        why = "images without masks do not tell where they look"
+    return Finding("note", "cameras-kept", f"cameras are taken as they are stated: {why}")
 
 
 def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
@@ -414,8 +454,34 @@ def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
     return True
 
 
-MENDS = (Mend("cameras", FILE_NAME, read_corrections, lambda steps, *asked: steps.refine_rig(*asked), _is_fixed_rig),)
+MENDS = (
+    Mend(
+        "masks",
+        mask_corrections.FILE_NAME,
+        read_mask_corrections,
+        lambda steps, *asked: steps.mend_masks(*asked),
+        lambda records: _has_own_names(next(iter(records.values()))),
+    ),
+    Mend(
+        "cameras",
+        corrections.FILE_NAME,
+        read_corrections,
+        lambda steps, *asked: steps.refine_rig(*asked),
+        _is_fixed_rig,
+    ),
+    Mend(
+        "exposures",
+        exposures.FILE_NAME,
+        read_exposures,
+        lambda steps, *asked: steps.find_exposures(*asked),
+        _is_fixed_rig,
+    ),
+)
 """What is put right, in this order: each step sees the capture as those before it left it."""
+
+
+def _has_own_names(records: Sequence[CaptureRecord]) -> bool:
+    return len({record.camera_name for record in records}) == len(records)
 
 
 def _corrected(records: Records, found: Iterable[Any]) -> Records:

@@ -2,114 +2,119 @@
 
 A capture's cameras are never exact, and a fit pays for each tenth of a pixel. What is done:
 
-1. Gaussians are fitted to reduced photographs, as key frames are, but for the term of normals. In every step the camera
-   that was looked through moves too, by the rasteriser's exact derivative (`Rasterizer.backward`), Adam, and steps that
-   are counted in pixels: turn, shift and focal length by what they move in the image. Levels go from coarse to fine;
-   each begins with a visual hull of the cameras so far, so that silhouettes have the first word.
-2. This is done twice, for the black and the white fields of a chessboard on every photograph. The mean of both is the
-   estimate. Half their difference is as large as its error, for they share no data.
-3. The gauge is the rig's: of all corrections that a motion and a scale of the world explain, none is left, and the mean
-   factor of the focal lengths is 1. So renders for other cameras are where they were.
-4. Corrections are undone unless they are beyond chance (an F test of the two mean squares) and beyond `OWN_ERROR`, what
-   the method finds in exact rigs. Then each camera's shrinks by what chance explains of it (James and Stein). An exact
-   rig therefore stays as it is, to the bit.
-5. A camera whose photograph is met much worse than the others' after the first half is left out and named, and all
-   begins again without it.
+1. Gaussians are fitted for a moment to photographs of half the size, as key frames are, from the visual hull of the
+   cameras as they are stated. What the photographs then say about their cameras, and how sure, is read off at once:
+   see `beam_warp.reconstruction.alignment`.
+2. If turns and focal lengths are within their errors over the whole rig, it is sound, and stays to the bit. Nothing
+   more is paid.
+3. Otherwise cameras are moved by what their photographs say, and Gaussians are fitted, in turns, until steps are within
+   their errors. Only kinds of numbers move that the photographs say are wrong beyond doubt: turns first; then focal
+   lengths, places and principal points, if what they explain beside the others is more than chance. Cameras that are
+   off by pixels are found at a coarser level first.
+4. The gauge is the rig's: of all corrections that a motion and a scale of the world explain, none is left, and the mean
+   factor of the focal lengths is 1. So renders for other cameras are where they were. Then each camera's correction
+   shrinks by what chance explains of it (James and Stein).
+5. A camera whose photograph is met much worse than the others', or whose silhouette contradicts theirs where something
+   is wrong, is left out and named, and all begins again without it. More than a third are refused.
 
-What pixels see of a camera is its turn and shift together: a turn and a shift sideways look the same but for depth. So
-places are found to a part of a pixel on the surface, not to a part of a millimetre where the camera stands. Principal
-points are not moved: a turn does nearly the same, and images do not tell them apart. Nor is a lens.
+A turn and a shift sideways look the same but for depth: an error of a part of a pixel that a view's surface shares is
+one of millimetres in place. So an error of place is mended by a turn, until the photographs tell the two apart, and
+`place_error` says how well they do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
-from scipy import stats
 
 from beam_warp.capture.corrections import CameraCorrection, RigCorrection, move_between, moved_camera
+from beam_warp.capture.findings import names_of
+from beam_warp.capture.silhouettes import contradicting
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
+from beam_warp.errors import AssetFormatError, InvalidArrayError
 from beam_warp.jobs.listeners import no_progress
-from beam_warp.kernels.reconstruction.image_halves import launch_keep_half
-from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianGradients
+from beam_warp.reconstruction.alignment import NUMBERS, Evidence, evidence, flow_of, rows_of, strength
 from beam_warp.reconstruction.fit import FitOptions, Fitter
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.initial import initial_gaussians
-from beam_warp.reconstruction.targets import ViewTargets, crop_views
+from beam_warp.reconstruction.targets import crop_views
 from beam_warp.world.camera import Camera
-from beam_warp.world.gaussians import GaussianCloud
 
 FEWEST_CAMERAS = 6
 """Fewest cameras of a rig: of fewer, one or two see most of the surface, and another shape explains their errors."""
 
-OWN_ERROR = 0.3
-"""Corrections up to this may be the method's own error [pixel, root mean square]: of exact rigs it finds 0.10 (runner),
-0.12 (walker) and 0.23 (robot, whose facets shine)."""
+CERTAIN = 1.5
+"""Corrections that are so many times their standard errors, root mean square over the rig, are made. In exact rigs that
+is about 1, by what the errors are."""
 
-CHANCE = 1e-3
-"""Probability below which corrections are not chance."""
-
-FREEDOM = 4
-"""Independent numbers that an image tells of a camera's turn, shift and focal length, about."""
-
-FIELD = 24
-"""Side of the fields of the chessboard [pixel]: about twice the window of structural similarity."""
+CERTAIN_ALONE = 6.0
+"""Those of one camera alone are made from here on."""
 
 MOST_BEHIND = 6.0
 """A camera whose photograph is met by so much less than the middle one's is left out [dB]."""
 
-FOCAL_EDGE = 0.3
-"""Distance from an image's middle, in its widths, at which a change of the focal length is counted in pixels."""
+ALIKE = 25.0
+"""A photograph that is met by more than this is of the subject, however much better others are met [dB]."""
 
-SHIFT_SHARE = 0.5
-"""Steps of shifts over those of turns, both in pixels: calibrations err more in where a camera looks."""
+MOST_LEFT_OUT = 1.0 / 3.0
+"""Part of a rig that may be left out: of more, nothing tells who is right."""
 
-MOMENTS = (0.7, 0.9)
-"""Decay of Adam's moments: a camera is looked through a dozen times, not thousands."""
+OVERSTEP = 1.6
+"""Steps over what photographs say: Gaussians that were fitted to a photograph have followed its camera a part of
+the way."""
 
+SETTLED = 0.5
+"""Rounds end when steps are so much smaller than the standard errors."""
 
-FAR = 0.5
-"""A coarse level that moved a camera by more is taken again with this one moved and the others where they were: steps
-reach no farther than about twice that, and what is far off misleads the others [pixel of the level]."""
+FAR = 1.0
+"""Steps beyond this are taken at a coarser level first [pixel of the level]."""
 
-MOST_REPEATS = 3
-"""How often levels are taken again, at most."""
+WORST_ERROR = 1.0
+"""Where standard errors are larger than this over a rig, photographs contradict each other [pixel]."""
+
+POOR = 20.0
+"""Where the middle photograph is met by less, silhouettes are asked whether they are of one subject [dB]."""
 
 FEWER_POINTS = 23
 """Every so many Gaussians are asked how far they move in an image: hundreds do."""
+
+MOVED_KINDS = ("turn", "focal", "shift", "center")
+"""Kinds of numbers that are moved where the photographs say so, most likely first."""
 
 NO_FACTS: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
 class Level:
-    """One of the rounds of refinement, from coarse to fine.
+    """One of the levels of refinement.
 
     Attributes:
         reduction: Pixels of the photograph along a side of those that are compared.
         share: Gaussians over those of the fit that follows.
-        visits: How often each camera is looked through, after as many steps as `warm` without moving it.
-        warm: Visits before cameras move.
-        first_step: Size of the first steps [pixel of the level].
-        last_step: Size of the last steps [pixel of the level].
+        warm: How often each camera is looked through before it is first judged.
+        visits: How often between two rounds.
+        rounds: Most rounds.
     """
 
     reduction: int
     share: float
-    visits: int
     warm: int
-    first_step: float
-    last_step: float
+    visits: int
+    rounds: int
+
+    @property
+    def total(self) -> int:
+        """Most visits of each camera."""
+        return self.warm + self.visits * self.rounds
 
 
-LEVELS = (Level(4, 1 / 4, 12, 2, 0.1, 0.01), Level(2, 1 / 2, 16, 2, 0.07, 0.004))
+LEVELS = (Level(4, 1 / 4, 8, 4, 4), Level(2, 1 / 2, 6, 4, 6))
 """Levels of refinement. A body that is five pixels wide, at a reduction of 8, misleads more than it helps."""
 
 FEWEST_GAUSSIANS, MOST_GAUSSIANS = 500, 20_000
@@ -140,91 +145,86 @@ def refine_rig(
         Corrections; None where there are fewer than `FEWEST_CAMERAS`, or a view has no mask.
 
     Raises:
-        InvalidArrayError: The masks have no volume in common.
+        InvalidArrayError: The masks have no volume in common, and no few of them are to blame.
+        AssetFormatError: Too many cameras contradict the others, or nothing tells which ones do.
         DeviceError: There is no such device.
     """
     if len(views) < FEWEST_CAMERAS or any(view.alpha is None for view in views):
         return None
-    target = resolve_device(device)
-    first = _half_found(views, options, 0, target, progress)
-    psnr = first.psnr()
-    is_bad = psnr < np.nanmedian(psnr) - MOST_BEHIND
-    if is_bad.any():  # it has misled the others
-        others = [k for k in range(len(views)) if not is_bad[k]]
-        kept = [names[k] for k in others]
-        rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
-        bad = {name: float(psnr[k]) for k, name in enumerate(names) if is_bad[k]}
-        return _left_out(bad, kept, rest)
-    given, cloud = [view.camera for view in views], first.parameters.cloud()
-    if (sound := _sound(names, given, first.found, cloud, psnr)) is not None:
-        return sound
-    second = _half_found(views, options, 1, target, progress)
-    return judged(names, given, [first.found, second.found], cloud, psnr)
+    given, fitter = [view.camera for view in views], None
+    try:
+        fitter = _fitted(views, options, resolve_device(device), progress)
+        is_bad = fitter.contradicting(views)
+    except InvalidArrayError:  # the masks share no volume
+        is_bad = contradicting(views)
+        if not is_bad.any():
+            raise
+    if fitter is not None and not is_bad.any():
+        return _credible(judged(names, given, fitter))
+    psnr = np.zeros(len(views)) if fitter is None else np.nan_to_num(fitter.quality)
+    bad = {names[k]: float(psnr[k]) for k in np.flatnonzero(is_bad).tolist()}
+    if len(bad) > MOST_LEFT_OUT * len(views):
+        raise AssetFormatError(
+            f"cameras must show one subject from where they are stated, got {len(bad)} of {len(views)} that contradict "
+            f"the others at {names_of(bad)}. Check that no two captures are mixed, and the calibration."
+        )
+    others = np.flatnonzero(~is_bad).tolist()  # they were misled
+    kept = [names[k] for k in others]
+    rest = refine_rig(kept, [views[k] for k in others], options, device=device, progress=progress)
+    return _left_out(bad, kept, rest)
 
 
-def _sound(
-    names: Sequence[str],
-    given: Sequence[Camera],
-    found: Sequence[Camera],
-    cloud: GaussianCloud,
-    psnr: NDArray[np.float64],
-) -> RigCorrection | None:
-    """Return that a rig is sound, which needs no second half, if the first found less than may be its own error."""
-    points, center = _points_of(cloud)
-    ends = in_gauge(given, found, center)
-    moved = np.array([pixels_between(one, other, points) for one, other in zip(given, ends, strict=True)])
-    if float(np.mean(np.square(moved))) > OWN_ERROR**2:
-        return None
-    return RigCorrection(
-        tuple(
-            CameraCorrection(name, pixels=float(pixels), error=OWN_ERROR, psnr=float(np.nan_to_num(quality)))
-            for name, pixels, quality in zip(names, moved, psnr, strict=True)
-        ),
-        is_applied=False,
-        confidence=0.0,
-    )
+def _credible(found: RigCorrection) -> RigCorrection:
+    """Return corrections, unless the photographs contradict each other too much to tell them."""
+    if found.is_applied and found.error > WORST_ERROR:
+        worst = max(found.cameras, key=lambda camera: camera.pixels)
+        raise AssetFormatError(
+            f"cameras must agree on one subject, got corrections of {found.pixels:.1f} ± {found.error:.1f} pixels, "
+            f"most at {worst.camera}. Check that no two captures are mixed, and the calibration; or keep the cameras "
+            "as they are stated."
+        )
+    return found
 
 
-def _points_of(cloud: GaussianCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return some points of a subject's surface, ``(N, 3)``, and its middle, ``(3,)`` [m]."""
-    positions = cloud.positions.astype(np.float64)
-    return positions[::FEWER_POINTS], np.median(positions, axis=0)
-
-
-def _half_found(
-    views: Sequence[CapturedView], options: FitOptions, half: int, device: Any, progress: StepProgress
-) -> RigFitter:
-    """Refine the cameras by one half of the pixels, from coarse to fine; return the finest level."""
+def _fitted(views: Sequence[CapturedView], options: FitOptions, device: Any, progress: StepProgress) -> RigFitter:
+    """Return the finest level after its last look, from coarser ones where cameras are far off."""
     cameras = [view.camera for view in views]
-    waiting, repeats = levels_of(cameras), MOST_REPEATS
-    total = 2 * sum(step_count(level, len(views)) for level in waiting)
-    taken = half * total // 2
-    while True:
-        level = waiting[0]
+    *coarse, finest = levels_of(cameras)
+    steps = _Steps(progress, sum(level.total for level in (*coarse, finest)) * len(views))
+    fitter = RigFitter(views, cameras, finest, options, device, steps)
+    fitter.settle(finest.warm)
+    if not fitter.kinds and fitter.behind().any():
+        fitter.settle(finest.total)  # it may only not be there yet
+    if not fitter.is_lost():
+        fitter.refine()
+        return fitter
+    if contradicting(views).any():  # which misleads the others, and is no matter of pixels
+        return fitter
+    if not (fitter.is_far() or fitter.behind().any()):
+        fitter.refine()
+        return fitter
+    for level in coarse:
+        fitter = RigFitter(views, cameras, level, options, device, steps)
+        fitter.settle(level.warm)
+        cameras = fitter.refine()
+    fitter = RigFitter(views, cameras, finest, options, device, steps)
+    fitter.settle(finest.warm)
+    fitter.refine()
+    return fitter
 
-        fitter = RigFitter(views, cameras, level, options, half, device)
-        fitter.run(_part_of(progress, taken, total))
-        points = fitter.parameters.cloud().positions[::FEWER_POINTS].astype(np.float64)
-        limit = FAR * level.reduction
-        far = [pixels_between(*pair, points) > limit for pair in zip(cameras, fitter.found, strict=True)]
-        if repeats and len(waiting) > 1 and any(far):  # the others gave way to these
-            cameras = [new if is_far else old for old, new, is_far in zip(cameras, fitter.found, far, strict=True)]
-            repeats -= 1
-            continue
-        cameras = fitter.found
-        taken += step_count(level, len(views))
-        waiting = waiting[1:]
-        if not waiting:
-            return fitter
 
+class _Steps:
+    """A listener to steps of several fits, of which there are at most so many in all."""
 
-def _part_of(progress: StepProgress, before: int, steps: int) -> StepProgress:
-    """Return a listener to the steps of one level, ``before`` of all ``steps`` taken."""
+    def __init__(self, progress: StepProgress, total: int) -> None:
+        """Begin with none."""
+        self._progress, self._total, self._done = progress, total, 0
 
-    def report(done: int, total: int, facts: Mapping[str, float] = NO_FACTS) -> None:
-        progress(before + done, steps, facts)
-
-    return report
+    def __call__(self, done: int, total: int, facts: Mapping[str, float] = NO_FACTS) -> None:
+        """Note steps of the fit under way."""
+        self._progress(min(self._done + done, self._total), self._total, facts)
+        if done == total:
+            self._done += total
 
 
 def _left_out(bad: Mapping[str, float], kept: Sequence[str], rest: RigCorrection | None) -> RigCorrection:
@@ -246,16 +246,14 @@ def levels_of(cameras: Sequence[Camera]) -> list[Level]:
     return [level for level in LEVELS[:-1] if side // level.reduction >= SHORTEST_SIDE] + [LEVELS[-1]]
 
 
-def step_count(level: Level, view_count: int) -> int:
-    """Return the steps of a level."""
-    return (level.visits + level.warm) * view_count
-
-
 class RigFitter(Fitter):
-    """The steps of one level of refinement, which move cameras with the Gaussians.
+    """One level of refinement: Gaussians are fitted for a while, cameras are moved by what the photographs say.
 
     Attributes:
-        found: The cameras so far, of the photographs' own size.
+        cameras: The cameras so far, of the photographs' own size.
+        kinds: Kinds of numbers that the photographs say are wrong.
+        found: What each photograph says about its camera, as of the last look.
+        quality: PSNR with which each photograph was met then [dB], ``(V,)``; NaN where it shows nothing.
     """
 
     def __init__(
@@ -264,8 +262,8 @@ class RigFitter(Fitter):
         cameras: Sequence[Camera],
         level: Level,
         options: FitOptions,
-        half: int,
         device: Any,
+        progress: StepProgress = no_progress,
     ) -> None:
         """Prepare a level, from the cameras that the one before found."""
         moved = [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
@@ -276,59 +274,121 @@ class RigFitter(Fitter):
             options,
             gaussian_count=len(start),
             target_psnr=None,
-            color_iterations=step_count(level, len(views)),
             normal_iterations=0,
             samples=1,
             temporal=0.0,
             refine_every=0,
         )
         super().__init__(reduced, start, fitting, device)
-        self.found = list(cameras)
-        self._level, self._half = level, half
+        self.cameras = list(cameras)
+        self.kinds: tuple[str, ...] = ()
+        self.found: list[Evidence] = []
+        self.quality = np.full(len(views), np.nan)
+        self._level, self._progress = level, progress
         self._reduced = [view.camera for view in reduced]
         self._corners = [_corner(view, part) for view, part in zip(reduced, crop_views(reduced), strict=True)]
-        center = np.median(start.positions, axis=0).astype(np.float64)
-        self._units = np.stack([units_of(view.camera, center) for view in reduced])
-        self._moves = np.zeros((len(views), 7))
-        self._moments = np.zeros((2, len(views), 7))
-        self._visits = np.zeros(len(views), int)
-        self._to_camera = wp.zeros((1, len(CAMERA_PARAMETERS)), dtype=float, device=device)
 
-    def _renew(self) -> float:
-        """Bring everything up to date; allocate what derivatives to cameras need, which a recording must not."""
-        psnr = super()._renew()
-        for group in dict.fromkeys(self._targets[view][0] for view in range(len(self._targets))):
-            group.rasterizer.backward(self._to_camera)
-        return psnr
+    def settle(self, visits: int) -> None:
+        """Fit the Gaussians, each camera looked through so often, and look what the photographs say then."""
+        self.options = replace(self.options, color_iterations=visits * len(self.cameras))
+        self.run(self._progress)
+        self.parameters.activate()
+        self.found = [self._evidence(view) for view in range(len(self.cameras))]
+        if not self.kinds:
+            self.kinds = wrong_kinds(self.found)
 
-    def _differentiated(self, group: ViewTargets, index: int) -> GaussianGradients:
-        """Compare one half of a view with what was drawn, and differentiate to its camera as well."""
-        group.add_losses(index, self._weights)
-        adjoints = group.rasterizer.adjoints()
-        for array in (*adjoints.channels, adjoints.alpha):
-            rows = array.reshape((array.shape[0], -1)) if array.ndim == 1 else array
-            launch_keep_half(group.width, FIELD, self._half, rows, self.device)
-        return group.rasterizer.backward(self._to_camera)
+    def refine(self) -> list[Camera]:
+        """Move cameras and fit Gaussians in turns, until steps are within their errors; return the cameras."""
+        for _ in range(self._level.rounds if self.kinds else 0):
+            steps = self.steps()
+            for view, step in enumerate(steps):
+                self._move(view, OVERSTEP * step)
+            self.settle(self._level.visits)
+            if self._is_settled(steps):
+                more = wrong_kinds(self.found, self.kinds)
+                if more == self.kinds:
+                    break
+                self.kinds = more
+        return self.cameras
 
-    def _stepped(self, view: int) -> None:
-        """Move the camera that was looked through, by Adam."""
-        level, visits = self._level, self._visits
-        visits[view] += 1
-        step = visits[view] - level.warm
-        if step <= 0:
-            return
-        size = level.first_step * (level.last_step / level.first_step) ** ((step - 1) / max(level.visits - 1, 1))
-        camera, row = self._reduced[view], self._to_camera.numpy()[0].astype(np.float64)
-        slope = np.array([*row[:6], row[6] * camera.focal_x + row[7] * camera.focal_y]) * self._units[view]
-        for moment, decay, value in zip(self._moments[:, view], MOMENTS, (slope, slope * slope), strict=True):
-            moment += (1.0 - decay) * (value - moment)
-        mean, square = (m / (1.0 - decay**step) for m, decay in zip(self._moments[:, view], MOMENTS, strict=True))
-        change = -size * mean / np.maximum(np.sqrt(square), 1e-30) * self._units[view]
-        self.found[view] = moved_camera(self.found[view], change)
-        self._reduced[view] = moved_camera(camera, change)
+    def behind(self) -> NDArray[np.bool_]:
+        """Return which photographs are met much worse than the others, ``(V,)``."""
+        return self.quality < min(float(np.nanmedian(self.quality)) - MOST_BEHIND, ALIKE)
+
+    def contradicting(self, views: Sequence[CapturedView]) -> NDArray[np.bool_]:
+        """Return which of all views contradict the others, by what they show or where it ends, ``(V,)``."""
+        return self.behind() | (contradicting(views) if self.is_lost() else False)
+
+    def is_lost(self) -> bool:
+        """Tell whether a camera is too far off, or too little is known, for steps to lead anywhere."""
+        is_poor = float(np.nanmedian(self.quality)) < POOR
+        return is_poor or self.is_far() or bool(self.behind().any()) or _root_mean_square(self.errors()) > WORST_ERROR
+
+    def steps(self) -> list[NDArray[np.float64]]:
+        """Return what the photographs say is wrong with each camera, ``(11,)`` each."""
+        return [found.solved(self.kinds)[0] for found in self.found]
+
+    def surface(self) -> NDArray[np.float64]:
+        """Return some points of the subject's surface, ``(N, 3)`` [m]."""
+        return self.parameters.cloud().positions[::FEWER_POINTS].astype(np.float64)
+
+    def is_far(self) -> bool:
+        """Tell whether a camera is so far off that a coarser level has to find it."""
+        points = self.surface()
+        moved = [pixels_of(*pair, points) for pair in zip(self.cameras, self.steps(), strict=True)]
+        return max(moved) > FAR * self._level.reduction
+
+    def _is_settled(self, steps: Sequence[NDArray[np.float64]]) -> bool:
+        """Tell whether steps were within their errors."""
+        points = self.surface()
+        moved = [pixels_of(*pair, points) for pair in zip(self.cameras, steps, strict=True)]
+        return _root_mean_square(moved) < SETTLED * _root_mean_square(self.errors())
+
+    def errors(self) -> list[float]:
+        """Return how well each photograph tells what is moved of its camera [pixel]."""
+        points, kinds = self.surface(), self.kinds or MOVED_KINDS[:1]
+        return [
+            error_of(camera, found.solved(kinds)[1], points)
+            for camera, found in zip(self.cameras, self.found, strict=True)
+        ]
+
+    def _evidence(self, view: int) -> Evidence:
+        """Return what a photograph says about its camera, in numbers of the photograph's own size."""
+        group, index = self._targets[view]
+        group.draw(index, self.parameters.drawn)
+        self.quality[view] = group.psnr(index)
+        drawn, photograph, depth = group.compared(index)
+        camera = self._reduced[view].cropped(*self._corners[view], group.width, group.height)
+        return evidence(drawn, photograph, depth, camera)
+
+    def _move(self, view: int, step: NDArray[np.float64]) -> None:
+        """Move a camera."""
+        self.cameras[view] = moved_camera(self.cameras[view], step[:9])
+        self._reduced[view] = moved_camera(self._reduced[view], step[:9])
         group, index = self._targets[view]
         cropped = self._reduced[view].cropped(*self._corners[view], group.width, group.height)
         group.move_camera(index, cropped)
+
+
+def wrong_kinds(found: Sequence[Evidence], known: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the kinds of numbers that photographs say are wrong: those that are known, and what surely is beside them.
+
+    Args:
+        found: What each photograph says.
+        known: Kinds that are moved already.
+    """
+    first, *others = MOVED_KINDS
+    if not known and is_certain(strength(found, [first], first)):
+        return (first,)
+    base = tuple(known) or (first,)
+    sizes = {kind: strength(found, [*base, kind], kind) for kind in others if kind not in base}
+    certain = {kind: _root_mean_square(size) for kind, size in sizes.items() if is_certain(size)}
+    return (*base, max(certain, key=lambda kind: certain[kind])) if certain else tuple(known)
+
+
+def is_certain(strengths: NDArray[np.float64]) -> bool:
+    """Tell whether corrections that are so many standard errors are beyond doubt, together or one alone."""
+    return bool(_root_mean_square(strengths) > CERTAIN or strengths.max() > CERTAIN_ALONE)
 
 
 def _corner(view: CapturedView, part: CapturedView) -> tuple[int, int]:
@@ -337,77 +397,75 @@ def _corner(view: CapturedView, part: CapturedView) -> tuple[int, int]:
     return round(whole.center_x - cut.center_x), round(whole.center_y - cut.center_y)
 
 
-def units_of(camera: Camera, center: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what of each number of a move is a step of a pixel, ``(7,)``."""
-    focal, distance = camera.focal_x, float(np.linalg.norm(camera.position - center))
-    shift = SHIFT_SHARE * distance / focal
-    return np.array([*[1.0 / focal] * 3, *[shift] * 3, 1.0 / (FOCAL_EDGE * camera.width)])
+def in_gauge(
+    given: Sequence[Camera],
+    moves: NDArray[np.float64],
+    points: NDArray[np.float64],
+    kinds: Collection[str] = ("turn", "shift"),
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return corrections without what a motion and a scale of the world explain of them.
 
-
-def in_gauge(given: Sequence[Camera], found: Sequence[Camera], center: NDArray[np.float64]) -> list[Camera]:
-    """Return found cameras without what a motion and a scale of the world explain of their corrections.
-
-    A motion of the world moves each camera's view of it by a twist that is linear in the motion's seven numbers, turn,
-    shift and scale about a centre. The one of least squares, in pixels, is undone; so is the mean factor of the focal
-    lengths.
+    A motion of the world by seven small numbers, turn, shift and scale about the points' middle, moves what cameras
+    show as corrections do. That which explains most of what the corrections move, in pixels, is undone by the numbers
+    that were corrected; so is the mean factor of the focal lengths.
 
     Args:
         given: Cameras as the capture states them.
-        found: The same, corrected.
-        center: Middle of the subject [m], ``(3,)``.
+        moves: Corrections, ``(V, 11)``.
+        points: Of the subject's surface [m], ``(N, 3)``.
+        kinds: Kinds of numbers that were corrected.
+
+    Returns:
+        The corrections, ``(V, 11)``, and what was undone: turn [rad], shift [m] and the logarithm of scale, ``(7,)``.
     """
-    moves = np.stack([move_between(one, other) for one, other in zip(given, found, strict=True)])
-    units = np.stack([units_of(camera, center)[:6] for camera in given])
-    effects = np.stack([_world_motion(camera, center) for camera in given])
-    world = np.linalg.lstsq(
-        (effects / units[:, :, None]).reshape(-1, 7), (moves[:, :6] / units).reshape(-1), rcond=None
-    )[0]
-    focal = moves[:, 6].mean()
-    return [moved_camera(camera, [*(-effect @ world), -focal]) for camera, effect in zip(found, effects, strict=True)]
+    chosen, center = rows_of(kinds), points.mean(axis=0)
+    result = moves.copy()
+    result[:, 6] -= moves[:, 6].mean()  # first: the world's scale does nearly the same
+    flows = [flow_of(camera, points).reshape(NUMBERS, -1).T for camera in given]
+    worlds = [part @ _world_motion(camera, center) for part, camera in zip(flows, given, strict=True)]
+    seen = np.concatenate([part @ move for part, move in zip(flows, result, strict=True)])
+    world = np.linalg.lstsq(np.concatenate(worlds), seen, rcond=None)[0]
+    for row, part, effect in zip(result, flows, worlds, strict=True):
+        if len(part):
+            row[chosen] -= np.linalg.lstsq(part[:, chosen], effect @ world, rcond=None)[0]
+    return result, world.astype(np.float64)
 
 
 def _world_motion(camera: Camera, center: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the twists of a camera, ``(6, 7)``, that turn, shift and scale of the world about a centre look like."""
+    """Return the numbers of a camera, ``(11, 7)``, that turn, shift and scale of the world about a centre look like."""
     to_camera, away = camera.camera_to_world[:3, :3].T, camera.position - center
     x, y, z = away
     across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    effect = np.zeros((6, 7))
+    effect = np.zeros((NUMBERS, 7))
     effect[:3, :3] = to_camera
-    effect[3:, :3] = -to_camera @ across
-    effect[3:, 3:6] = to_camera
-    effect[3:, 6] = to_camera @ away
+    effect[3:6, :3] = -to_camera @ across
+    effect[3:6, 3:6] = to_camera
+    effect[3:6, 6] = to_camera @ away
     return effect
 
 
-def judged(
-    names: Sequence[str],
-    given: Sequence[Camera],
-    found: Sequence[Sequence[Camera]],
-    cloud: GaussianCloud,
-    psnr: NDArray[np.float64],
-) -> RigCorrection:
-    """Return the corrections that two refinements agree on, with their errors.
+def judged(names: Sequence[str], given: Sequence[Camera], fitter: RigFitter) -> RigCorrection:
+    """Return the corrections that a fit found, with their errors.
 
     Args:
         names: Names of the cameras.
         given: Cameras as the capture states them.
-        found: What each of the two refinements found.
-        cloud: Gaussians of the subject.
-        psnr: Quality with which each photograph was met [dB]; NaN where it shows nothing.
+        fitter: The finest level, after its last look.
     """
-    points, center = _points_of(cloud)
-    ends = [in_gauge(given, cameras, center) for cameras in found]
-    first, second = (
-        np.stack([move_between(one, other) for one, other in zip(given, end, strict=True)]) for end in ends
-    )
-    means = 0.5 * (first + second)
-    moved = np.array([pixels_between(c, moved_camera(c, m), points) for c, m in zip(given, means, strict=True)])
-    errors = 0.5 * np.array([pixels_between(one, other, points) for one, other in zip(ends[0], ends[1], strict=True)])
-    noise, signal = float(np.mean(np.square(errors))), float(np.mean(np.square(moved)))
-    confidence = signal / max(noise, 1e-12)
-    freedom = FREEDOM * len(given)
-    is_applied = bool(signal > OWN_ERROR**2 and confidence > stats.f.isf(CHANCE, freedom, freedom))
-    kept = np.maximum(0.0, 1.0 - noise / np.maximum(np.square(moved), 1e-30)) if is_applied else np.zeros(len(moved))
+    points, psnr = fitter.surface(), fitter.quality
+    is_applied = bool(fitter.kinds)
+    kinds = fitter.kinds or MOVED_KINDS[:1]
+    if is_applied:
+        moves = np.array([[*move_between(*pair), 0.0, 0.0] for pair in zip(given, fitter.cameras, strict=True)])
+    else:
+        moves = np.stack([found.solved(kinds)[0] for found in fitter.found])
+    moves[:, ~np.isin(np.arange(NUMBERS), rows_of(kinds))] = 0.0  # but for rounding
+    moves, world = in_gauge(given, moves, points, kinds)
+    covariances = [found.solved(kinds)[1] for found in fitter.found]
+    moved = np.array([pixels_of(*pair, points) for pair in zip(given, moves, strict=True)])
+    errors = np.array([error_of(*pair, points) for pair in zip(given, covariances, strict=True)])
+    kept = np.maximum(0.0, 1.0 - np.square(errors) / np.maximum(np.square(moved), 1e-30)) * is_applied
+    places = [found.solved({*kinds, "shift"})[1][3:6, 3:6] for found in fitter.found]
     return RigCorrection(
         tuple(
             CameraCorrection(
@@ -415,22 +473,34 @@ def judged(
                 turn=tuple(move[:3]),
                 shift=tuple(move[3:6]),
                 log_focal=float(move[6]),
+                center=tuple(move[7:9]),
                 pixels=float(pixels),
-                error=float(np.hypot(error, np.sqrt(noise)) / np.sqrt(2.0)),
+                error=float(error),
+                place_error=float(np.sqrt(np.trace(place))),
                 psnr=float(np.nan_to_num(quality)),
             )
-            for name, move, pixels, error, quality in zip(
-                names, means * kept[:, None], moved, errors, psnr, strict=True
+            for name, move, pixels, error, place, quality in zip(
+                names, moves * kept[:, None], moved, errors, places, psnr, strict=True
             )
         ),
         is_applied,
-        confidence,
+        confidence=float(np.mean(np.square(moved)) / max(np.mean(np.square(errors)), 1e-12)),
+        kinds=kinds if is_applied else (),
+        world=tuple(world) if is_applied else (0.0,) * 7,
     )
 
 
-def pixels_between(camera: Camera, other: Camera, points: NDArray[np.float64]) -> float:
-    """Return the root mean square distance of what two cameras show of the same points [pixel]; 0 if that is none."""
-    apart = camera.project(points)[:, :2] - other.project(points)[:, :2]
-    squares = np.square(apart).sum(axis=1)
-    seen = np.isfinite(squares)
-    return float(np.sqrt(squares[seen].mean())) if seen.any() else 0.0
+def pixels_of(camera: Camera, move: NDArray[np.float64], points: NDArray[np.float64]) -> float:
+    """Return how far a correction moves points in an image, root mean square [pixel]; 0 if it shows none of them."""
+    moved = np.tensordot(move, flow_of(camera, points), axes=1)
+    return float(np.sqrt(np.square(moved).sum(axis=0).mean())) if moved.size else 0.0
+
+
+def error_of(camera: Camera, covariance: NDArray[np.float64], points: NDArray[np.float64]) -> float:
+    """Return the standard error of where an image shows points [pixel], from the covariance of its camera's numbers."""
+    part = flow_of(camera, points)
+    return float(np.sqrt(np.einsum("iap,ij,jap->p", part, covariance, part).mean())) if part.size else 0.0
+
+
+def _root_mean_square(values: Sequence[float] | NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

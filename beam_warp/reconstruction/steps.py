@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp.capture.capture import SparsePoints
 from beam_warp.capture.corrections import RigCorrection
+from beam_warp.capture.exposures import RigExposures
 from beam_warp.capture.findings import Finding
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
@@ -21,8 +23,11 @@ from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
+from beam_warp.reconstruction.masks import mend_masks
+from beam_warp.reconstruction.photometry import find_exposures
 from beam_warp.reconstruction.rig import refine_rig
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 
 MOST_UNPAIRED = 0.5
@@ -41,12 +46,14 @@ class FitAndTrack:
         fitting: How key frames are fitted.
         tracking: How other frames follow from the one before; drawn and compared as `fitting` says.
         points: Known points of the surfaces, for images without masks; None if there are none.
+        environment: The light of the capture, by which exposures are told from gloss; None if it is not known.
         device: Warp device; None takes the first CUDA device, or the CPU.
     """
 
     fitting: FitOptions = field(default_factory=FitOptions)
     tracking: TrackOptions = field(default_factory=TrackOptions)
     points: SparsePoints | None = None
+    environment: EnvironmentMap | None = None
     device: str | None = None
 
     @property
@@ -63,14 +70,29 @@ class FitAndTrack:
         return {
             "fitting": asdict(self.fitting),
             "tracking": asdict(self._tracking),
-            "points": None if self.points is None else _digest(self.points),
+            "points": None if self.points is None else _digest(self.points.positions, self.points.colors),
+            "environment": None if self.environment is None else _digest(self.environment.radiance),
         }
+
+    def mend_masks(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> MaskCorrections:
+        """Find how far the masks of cut-outs are off, from what they show at one moment."""
+        return mend_masks(names, views, self.fitting, device=self.device, progress=progress)
 
     def refine_rig(
         self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
     ) -> RigCorrection | None:
         """Find what is wrong with the cameras of a rig, from what they show at one moment."""
         return refine_rig(names, views, self.fitting, device=self.device, progress=progress)
+
+    def find_exposures(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> RigExposures | None:
+        """Find exposures and white balances of a rig, from what its cameras show at one moment; None without light."""
+        if self.environment is None:
+            return None
+        return find_exposures(names, views, self.environment, self.fitting, device=self.device, progress=progress)
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
         """Fit a key frame from its images alone, their exposures matched."""
@@ -151,8 +173,9 @@ def _exposures(gains: ViewGains) -> dict[str, float]:
     return {"exposure_spread": float(np.nanmax(off))} if np.isfinite(off).any() else {}
 
 
-def _digest(points: SparsePoints) -> str:
-    digest = hashlib.blake2b(np.ascontiguousarray(points.positions).tobytes(), digest_size=16)
-    if points.colors is not None:
-        digest.update(np.ascontiguousarray(points.colors).tobytes())
+def _digest(*arrays: NDArray[Any] | None) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

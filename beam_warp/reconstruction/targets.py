@@ -255,6 +255,18 @@ class ViewTargets:
         self.select(index)
         self.rasterizer.draw(gaussians)
 
+    def compared(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return what was drawn last and a view with coverage, encoded, ``(H, W, 4)`` each, and depth ``(H, W)`` [m].
+
+        Pixels are drawn by one sample, so that each has a depth.
+        """
+        alpha = self._alphas[index]
+        assert alpha is not None
+        assert self.samples == 1
+        launch_average(self._color, self.samples, True, self._encoded, self.device)
+        drawn = np.dstack([self._encoded.numpy(), self._alpha.numpy()])
+        return drawn, np.dstack([self._colors[index].numpy(), alpha.numpy()]), self._depth.numpy()
+
     def gap(self, index: int) -> float:
         """Return the largest connected part of a view's subject that what was drawn last does not cover, a fraction.
 

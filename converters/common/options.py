@@ -61,6 +61,7 @@ class WriteOptions:
         sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.
         spz_version: SPZ only. 3 is read by nearly everything; 4 is smaller and also holds degree 4.
         full_float: USD only. Single precision throughout instead of half where half suffices.
+        error_scale: b4d only. Factor of all bounds on the errors of delivery, in [0.01, 100].
         lighting_variants: USD only. Adds a variant whose radiance is the base colour, for renderers that light it.
 
     Raises:
@@ -74,6 +75,7 @@ class WriteOptions:
     spz_version: int = 3
     full_float: bool = False
     lighting_variants: bool = False
+    error_scale: float = 1.0
 
     def __post_init__(self) -> None:
         """Check each option."""
@@ -84,4 +86,5 @@ class WriteOptions:
         require_choice("profile", self.profile, ("standard", "beam"))
         if self.sh_degree is not None:
             require_count("sh_degree", self.sh_degree, 0, 3)
+        require_number("error_scale", self.error_scale, 0.01, 100.0)
         require_count("spz_version", self.spz_version, 3, 4)

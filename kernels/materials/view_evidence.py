@@ -1,7 +1,8 @@
 """Evidence that the pixels of views give on the Gaussians that they show: place, normal and colour of the surface.
 
 Pixels carry sums to be spread back over Gaussians by their blending weights: 0-2 place relative to an origin, 3-5
-normal, 6 weight of both; 7 weight of saturated pixels; 8-10 captured colour less the rendered one, 11 its weight.
+normal, 6 weight of both; 7 weight of saturated pixels; 8-10 square of what follows, less what noise makes it; 11-13
+captured colour less the rendered one, 14 its weight. 15 is not used: pixels are moved by four numbers at a time.
 """
 
 import warp as wp
@@ -12,7 +13,7 @@ from beam_warp.kernels.raster.project import RasterView
 
 wp.set_module_options({"enable_backward": False})
 
-PIXEL_CHANNELS = 12
+PIXEL_CHANNELS = 16
 
 LEAST_SURFACE_ALPHA = wp.constant(0.95)
 """Coverage by Gaussians from which on a pixel shows a surface."""
@@ -38,6 +39,7 @@ class CapturedPixels:
     color: wp.array[wp.vec3]  # scene-linear, premultiplied
     coverage: wp.array[float]
     ceiling: float  # value that the image cannot exceed
+    noise: float  # variance of a pixel over its value
 
 
 @wp.kernel
@@ -51,7 +53,7 @@ def write_pixels_kernel(
 ):
     local = first + wp.tid()
     pixel = view.first_pixel + local
-    for c in range(12):
+    for c in range(16):
         out_pixels[pixel, c] = 0.0
     alpha = drawn.alpha[pixel]
     if not (alpha > LEAST_SURFACE_ALPHA):
@@ -78,8 +80,9 @@ def write_pixels_kernel(
         rendered = wp.max(drawn.colors[pixel, c], 0.0)
         if drawn.display_srgb == 1:
             rendered = srgb_to_linear(wp.min(rendered, 1.0))
-        out_pixels[pixel, 8 + c] = color[c] - rendered
-    out_pixels[pixel, 11] = 1.0
+        out_pixels[pixel, 8 + c] = (color[c] - rendered) * (color[c] - rendered) - captured.noise * rendered
+        out_pixels[pixel, 11 + c] = color[c] - rendered
+    out_pixels[pixel, 14] = 1.0
 
 
 @wp.kernel
@@ -114,11 +117,11 @@ def observe_kernel(
     i = splat % count
     local = splat / count
     toward = wp.normalize(views[local].position - positions[i])
-    weight = rows[splat, 11]
+    weight = rows[splat, 14]
     color = wp.vec3()
     if weight > 0.0:
         color = captured_radiance(radiance, i, -toward, display_srgb)
-        color += wp.vec3(rows[splat, 8], rows[splat, 9], rows[splat, 10]) / weight
+        color += wp.vec3(rows[splat, 11], rows[splat, 12], rows[splat, 13]) / weight
     out_colors[first_view + local, i] = wp.vec4(color[0], color[1], color[2], weight)
     out_directions[first_view + local, i] = toward
 

@@ -2,13 +2,17 @@
 
 import argparse
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import flaws as benchmark
 import numpy as np
 import pytest
 import tables_flaws
+from support.fake_steps import write_capture
 
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera
 from beam_warp.capture.findings import Finding
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import sh_basis
@@ -75,6 +79,27 @@ def test_colors_in_units_of_white_are_those_of_the_clean_capture(rng):
     np.testing.assert_allclose(after, 1.6 * before, atol=1e-5)
 
 
+def test_poses_are_compared_but_for_a_motion_of_the_world(tmp_path, rng):
+    capture = Capture.read(write_capture(tmp_path / "ball", (0,), cameras=8))
+    surface = rng.uniform(-0.5, 0.5, (400, 3))
+    world = np.eye(4)
+    world[:3, 3] = [2e-3, 0.0, -1e-3]
+    shaken = []
+    for entry in capture.records:
+        pose = world @ entry.camera.camera_to_world
+        shaken.append(replace(entry, camera=replace(entry.camera, camera_to_world=pose)))
+    turned = moved_camera(shaken[0].camera, [0.01, *[0.0] * 8])
+    shaken[0] = replace(shaken[0], camera=turned)
+    copy = Capture(**{**vars(capture), "records": tuple(shaken)})
+    mend = RigCorrection((CameraCorrection("c0", turn=(-0.01, 0.0, 0.0)),), is_applied=True, confidence=9.0)
+    found = benchmark.recovered_poses(capture, copy, mend, surface)
+    assert found["pose_pixels_injected"] > 0.05
+    assert found["pose_pixels"] < 1e-3
+    assert found["pose_mm"] < 1e-2
+    assert found["gauge_mm"] == pytest.approx(1e3 * np.hypot(2e-3, 1e-3), rel=1e-2)
+    assert benchmark.recovered_poses(capture, copy, None, surface)["pose_mm"] == found["pose_mm_injected"]
+
+
 def test_rows_of_other_code_are_not_continued(tmp_path):
     out = tmp_path / "flaws.json"
     assert benchmark.known_rows(argparse.Namespace(out=out)) == []
@@ -85,6 +110,23 @@ def test_rows_of_other_code_are_not_continued(tmp_path):
         benchmark.known_rows(argparse.Namespace(out=out))
 
 
+def test_errors_of_gains_are_those_over_the_rig_s():
+    """A factor that all cameras share is none; a stop too much in one of two is half a stop in each."""
+    injected = {"a": {"exposure_stops": 1.0, "white_balance": [0.25, 0.0]}}
+    balance = np.log([1.25, 1.0, 1.0]) - np.log(1.25) / 3.0
+    stops = 1.0 + np.log2(1.25) / 3.0
+    right = {"camera": "a", "stops": stops, "balance": balance, "gains": 4.0 * np.array([2.5, 2.0, 2.0])}
+    cameras = [right, {"camera": "b", "stops": 0.0, "balance": [0.0] * 3, "gains": [4.0] * 3}]
+    assert benchmark.gain_errors(injected, cameras) == pytest.approx(dict.fromkeys(NAMES, 0.0), abs=1e-12)
+    cameras[1]["stops"] = 1.0
+    found = benchmark.gain_errors(injected, cameras)
+    assert found["exposure_found"] == pytest.approx(0.5 * np.log(2.0))
+    assert found["white_balance_found"] == pytest.approx(0.0, abs=1e-12)
+
+
+NAMES = ("exposure_found", "white_balance_found", "exposure_error", "white_balance_error")
+
+
 def test_the_table_has_the_clean_capture_first_and_then_the_worst():
     def row(flaw, level, seed=0, **more):
         score = {"psnr": level, "ssim": 0.9}
@@ -93,7 +135,7 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
         case = {"capture": "walker", "flaw": flaw, "size": 1.0, "seed": seed}
         stops = {"light_stops": 0.5, "light_stops_injected": 0.25}
         found = {**stops, "exposure_spread": 0.1, "exposure_spread_injected": 0.2}
-        errors = {key: {"within_1": 0.6, "within_2": 0.9} for key in ("base_color", "roughness")}
+        errors = {key: {"within_1": 0.6, "within_2": 0.9} for key in ("base_color", "base_color_scaled", "roughness")}
         said = {"recovered": found, "errors": errors, "seconds": {"run": 7.0}, "named": {}, "beside": [], **more}
         return {"case": case, "scores": {**images, **numbers}, **said}
 
@@ -104,7 +146,7 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
     assert [cells[1] for cells in body] == ["30.0 dB / 0.900", "21.0 dB / 0.900", "29.0 dB / 0.900"]
     assert [cells[-1] for cells in body] == ["also `few-cameras`", "masks in 1 of 2 runs", ""]
     _, first, *_ = tables_flaws.recovered({"rows": rows})
-    assert first == ["nothing", "+0.50", "-0.25", "0.10", "0.20", "60 %, 90 %", "60 %, 90 %", "7"]
+    assert first == ["nothing", "+0.50", "-0.25", "0.10", "0.20", *["60 %, 90 %"] * 3, "7"]
 
 
 def test_what_was_refused_has_a_row():
@@ -120,7 +162,7 @@ def test_a_case_is_made_scored_and_continued(tiny_capture, tmp_path):
     asked = argparse.Namespace(frames=1, gaussians=300, preset="draft", device="cpu")
     row = benchmark.measure(tiny_capture, "noise", 1.0, 0, asked, tmp_path)
     assert row["gaussians"] <= 300
-    assert row["named"] == {"noise": False}
+    assert set(row["named"]) == {"noise"}
     assert row["scores"]["novel_view"]["psnr"] > 15.0  # in the clean capture's units, or it would be dim
     assert 0.0 < row["errors"]["base_color"]["within_1"] <= row["errors"]["base_color"]["within_2"] <= 1.0
     assert row["recovered"]["light_stops_injected"] == 0.0

@@ -29,21 +29,23 @@ def rig(**changes):
         CameraCorrection("c1", pixels=0.2, error=0.1, psnr=29.0),
         CameraCorrection("c2", pixels=5.0, error=2.0, psnr=12.0, is_used=False),
     )
-    return RigCorrection(**{"cameras": cameras, "is_applied": True, "confidence": 40.0, **changes})
+    facts = {"is_applied": True, "confidence": 40.0, "kinds": ("turn", "focal"), "world": tuple(np.arange(7.0))}
+    return RigCorrection(**{"cameras": cameras, **facts, **changes})
 
 
 def test_a_point_is_turned_and_shifted_in_the_camera_s_axes(rng):
-    move = np.array([0.02, -0.03, 0.01, 0.1, -0.2, 0.05, 0.1])
+    move = np.array([0.02, -0.03, 0.01, 0.1, -0.2, 0.05, 0.1, 0.02, -0.01])
     points = rng.uniform(-0.5, 0.5, (20, 3))
     local = (points - CAMERA.position) @ CAMERA.camera_to_world[:3, :3]
     moved = Rotation.from_rotvec(move[:3]).apply(local) + move[3:6]
     focal = CAMERA.focal_x * np.exp(0.1)
-    expected = focal * moved[:, :2] / moved[:, 2:] + (CAMERA.center_x, CAMERA.center_y)
+    middle = np.array([CAMERA.center_x, CAMERA.center_y]) + CAMERA.focal_x * move[7:9]
+    expected = focal * moved[:, :2] / moved[:, 2:] + middle
     np.testing.assert_allclose(moved_camera(CAMERA, move).project(points)[:, :2], expected, atol=1e-9)
 
 
 def test_moves_are_found_again(rng):
-    move = rng.normal(0.0, 0.05, 7)
+    move = rng.normal(0.0, 0.05, 9)
     np.testing.assert_allclose(move_between(CAMERA, moved_camera(CAMERA, move)), move, atol=1e-12)
 
 

@@ -136,7 +136,7 @@ def test_masks_that_are_off_are_named_with_their_cameras(tmp_path):
     assert (finding.severity, finding.code) == ("warning", "mask-offset")
     assert "c02 +" in finding.where
     assert "c05 -" in finding.where
-    assert finding.what.startswith("masks of 2 cameras end more than 0.5 pixel outside")
+    assert finding.what.startswith("masks of 2 cameras end outside")
 
 
 def test_colour_under_a_clear_alpha_is_the_backdrop(tmp_path):

@@ -9,7 +9,9 @@ import pytest
 import trimesh
 from PIL import Image as PillowImage
 from support.commands import beam
-from support.sound_capture import CAMERAS, FLIP, FRAMES, rewrite, save, write_sound
+from support.sound_capture import CAMERAS, FLIP, FRAMES, TARGET, rewrite, rig, save, write_sound
+
+from beam_warp.capture.corrections import FILE_NAME, CameraCorrection, RigCorrection
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,40 @@ def test_words_json_and_quiet(sound, capsys):
     assert capsys.readouterr().out == ""
 
 
+def corrections(**changes):
+    """Corrections of a camera that is turned, one that is left out, and sound ones."""
+    cameras = [CameraCorrection(f"c{k:02d}", pixels=0.01, error=0.02, place_error=4e-3) for k in range(CAMERAS)]
+    cameras[2] = CameraCorrection("c02", turn=(0.0, 0.01, 0.0), pixels=0.41, error=0.02, place_error=4e-3)
+    cameras[5] = CameraCorrection("c05", is_used=False)
+    return RigCorrection(tuple(cameras), **{"is_applied": True, "confidence": 9.0, "kinds": ("turn",), **changes})
+
+
+def test_what_a_reconstruction_found_wrong_with_cameras_is_said_and_drawn(sound, tmp_path, capsys):
+    (tmp_path / "reconstruction").mkdir()
+    (tmp_path / "reconstruction" / FILE_NAME).write_text(json.dumps(corrections().as_dict()))
+    assert beam("inspect", sound, "--cameras", tmp_path, "--out", tmp_path) == 0
+    said = capsys.readouterr().out
+    assert "cameras contradict each other by 0.12 ± 0.02 pixels, at most 0.41, and were moved to agree (c02)" in said
+    assert "; cameras moved by 0.12 ± 0.02 pixels (turn); images tell places to ± 3.8 mm)" in said
+    text = (tmp_path / "capture.html").read_text(encoding="utf-8")
+    assert "<span>c02</span><span>0.41 ± 0.02 px</span>" in text
+    assert "<span>c05</span><span>contradicts</span>" in text
+    data = json.loads(re.search(r'id="data">(.*?)</script>', text).group(1))
+    assert ["moved by" in camera["text"] for camera in data["cameras"]] == [k != 5 for k in range(CAMERAS)]
+    with PillowImage.open(tmp_path / "capture.png") as picture:
+        assert (np.asarray(picture.convert("RGB")) == (255, 212, 0)).all(axis=-1).any()  # the arrow
+    sound_rig = json.dumps(corrections(is_applied=False).as_dict())
+    (tmp_path / FILE_NAME).write_text(sound_rig)
+    assert beam("inspect", sound, "--cameras", tmp_path, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["corrections"] == json.loads(sound_rig)
+
+
+def test_the_arrow_of_a_correction_points_where_the_subject_went():
+    camera = rig()[2]
+    way = corrections().ways({"c02": camera}, TARGET)["c02"]  # turned down by 0.01: what is ahead comes to the right
+    np.testing.assert_allclose(way, [0.01 * camera.focal_x, 0.0], atol=1e-3)
+
+
 def test_an_error_is_exit_code_1(tmp_path, capsys):
     content = write_sound(tmp_path)
     for record in content["frames"]:
@@ -80,6 +116,9 @@ def test_what_cannot_be_read_or_written(tmp_path, refused):
     (tmp_path / "file").touch()
     write_sound(tmp_path)
     refused("inspect", tmp_path, "--out", tmp_path / "file", says="out must be a folder")
+    refused("inspect", tmp_path, "--cameras", tmp_path, says="cameras must be the folder of a reconstruction with")
+    (tmp_path / FILE_NAME).write_text("{}")
+    refused("inspect", tmp_path, "--cameras", tmp_path, says="corrections of cameras must be as beam reconstruct")
 
 
 def test_the_page_needs_nothing_and_its_script_runs(pages, tmp_path):

@@ -2,16 +2,22 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.commands import beam
 from support.fake_steps import FakeSteps, write_capture
+from support.moving_ball import ball_views, rig
+from support.sound_capture import rewrite, write_sound
 
 from beam_warp.capture.capture import Capture
+from beam_warp.capture.corrections import moved_camera
 from beam_warp.cli.reconstruct import Modelling, frames_of, steps_of
 from beam_warp.cli.run import capture_at
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError
+from beam_warp.image.files import write_exr
+from beam_warp.world.environment import EnvironmentMap
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +30,7 @@ def asked(monkeypatch):
     """What was asked of the steps; the fake does them."""
     found = []
 
-    def steps_of(modelling, capture, seed, device):
+    def steps_of(modelling, capture, seed, device, environment):
         found.append((modelling, seed, device))
         return FakeSteps(count=modelling.gaussians or 60, seed=seed)
 
@@ -65,7 +71,7 @@ class TestReconstruct:
         assert beam("plan", tmp_path / "2", "--html", tmp_path / "page.html") == 0
         said = capsys.readouterr().out
         assert re.search(r"frame +4/4 +0 +0", said)
-        assert "all 9 steps are done" in said
+        assert "all 11 steps are done" in said
         page = (tmp_path / "page.html").read_text()
         assert page.count("<img") == page.count('src="2/previews/') == 4
 
@@ -101,6 +107,20 @@ def test_mistakes_cost_no_reconstruction(folder, asked, tmp_path, refused, words
     dark = write_capture(tmp_path / "dark", (0,), environment=False)
     words = words.format(folder=folder, dark=dark)
     refused(*words.split(), "--out", tmp_path / "out", says=says)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "says"),
+    [
+        (0, "got 24 images are of nothing, by mask or alpha, and left out"),
+        (255, "got mask or alpha of 24 images of 24 is white everywhere: background counts as the subject does at c00"),
+    ],
+)
+def test_masks_that_tell_nothing_are_named(tmp_path, refused, alpha, says):
+    content = write_sound(tmp_path / "capture", frames=2)
+    for entry in content["frames"]:
+        rewrite(tmp_path / "capture" / entry["file_path"], lambda pixels: pixels[..., 3].fill(alpha))
+    refused("reconstruct", tmp_path / "capture", "--out", tmp_path / "out", says=says)
 
 
 def test_a_run_from_images_to_an_asset_and_again(folder, asked, tmp_path, capsys):
@@ -142,12 +162,17 @@ class TestDetection:
 def test_the_words_reach_the_optimiser(folder):
     """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
     capture = Capture.read(folder)
-    steps = steps_of(Modelling(gaussians=123, target_psnr=31.5, preset="paper"), capture, seed=7, device="cpu")
+    steps = steps_of(
+        Modelling(gaussians=123, target_psnr=31.5, preset="paper"), capture, seed=7, device="cpu", environment=None
+    )
     asked = json.loads(json.dumps(steps.options()))["fitting"]
     assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
     assert steps.device == "cpu"
-    fast = steps_of(Modelling(gaussians=123, target_psnr=31.5), capture, seed=7, device="cpu")
+    fast = steps_of(
+        Modelling(gaussians=123, target_psnr=31.5), capture, 7, "cpu", EnvironmentMap.constant([1.0, 1.0, 1.0])
+    )
     assert steps.options() != fast.options()
+    assert steps.options()["environment"] != fast.options()["environment"]
 
 
 @pytest.mark.parametrize(
@@ -174,3 +199,43 @@ def test_the_walker(data_dir, asked, tmp_path, capsys):
     assert report["input"]["cameras"] == 24
     assert np.isfinite(report["mean_psnr"])
     assert len(Capture.read(walker).select(split="train", frames=[0])) == report["input"]["cameras"]
+
+
+class TestContradictions:
+    """Cameras that do not show one subject are named in one line, before hours are spent on them."""
+
+    @staticmethod
+    def write(folder, views):
+        """Write cut-outs and their cameras as a capture of one frame."""
+        folder.mkdir()
+        records = []
+        for k, view in enumerate(views):
+            path = f"{k}.exr"
+            write_exr(folder / path, {"RGBA"[i]: view.color[..., i] for i in range(3)} | {"A": view.alpha})
+            pose = view.camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
+            records.append({"file_path": path, "camera": f"c{k}", "frame": 0, "transform_matrix": pose.tolist()})
+        camera = views[0].camera
+        content = {"w": camera.width, "h": camera.height, "fl_x": camera.focal_x, "fl_y": camera.focal_y}
+        content |= {"cx": camera.center_x, "cy": camera.center_y, "frames": records}
+        (folder / "transforms.json").write_text(json.dumps(content))
+        return folder
+
+    @pytest.mark.parametrize("case", ["mixed", "contradicting"])
+    def test_the_culprits_are_named(self, case, tmp_path, capsys):
+        cameras = rig(11, 48)
+        views = ball_views(cameras)
+        if case == "mixed":  # with a capture of another place, by the same cameras
+            others = ball_views(cameras, center=(0.3, 0.3, 0.3))
+            views = [others[k] if k in (1, 4, 6, 8) else view for k, view in enumerate(views)]
+        else:
+            turned = {1: 0.18, 4: -0.18, 6: 0.2, 8: -0.2}
+            views = [
+                replace(view, camera=moved_camera(view.camera, [turned.get(k, 0.0), *[0.0] * 8]))
+                for k, view in enumerate(views)
+            ]
+        words = ("reconstruct", self.write(tmp_path / case, views), "--out", tmp_path / "out", "--device", "cpu")
+        assert beam(*words, "--gaussians", 500, "--preset", "draft", "--quiet") == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert "got 4 of 11 that contradict the others at c1, c4, c6, c8. Check that no two captures are mixed" in line
+        kept = [path.parent.name for path in (tmp_path / "out").rglob("*") if path.is_file()]
+        assert set(kept) <= {"digests"}  # which a second call need not make again

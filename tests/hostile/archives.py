@@ -1,11 +1,14 @@
 """Sound archives of every kind that is read, and how each is spoiled: its directory, its members, what they hold."""
 
+import copy
+import hashlib
 import io
 import json
 import math
 import pickle
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +18,12 @@ import numpy as np
 from hostile.splats import read_frames, written
 from hostile.ways import BOMB_BYTES, Case, Inside, Reader, Ways, bomb
 from PIL import Image as PillowImage
+from support.radiant_cloud import radiant_cloud
 
+from beam_warp import converters
+from beam_warp.converters.delivery import writer
 from beam_warp.schema.reader import read_asset
+from beam_warp.world.gaussians import GaussianSequence
 
 
 def zipped(files: Mapping[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
@@ -275,7 +282,95 @@ def frames(folder: Path) -> Path:
 
 CRATE = {"version": (8, "<H"), "table of contents": (16, "<Q")}
 
+# Delivery
+
+
+def delivery(folder: Path) -> Path:
+    """Three relightable Gaussians that move over two frames."""
+    clouds = [radiant_cloud(3, 0, materials=True, seed=7, positions=place * np.eye(3)) for place in (1.0, 2.0)]
+    converters.write(GaussianSequence.from_clouds(clouds), folder / "a.b4d")
+    return folder / "a.b4d"
+
+
+def delivery_folder(folder: Path) -> Path:
+    """The files of a container beside each other."""
+    for name, content in unzipped(delivery(folder).read_bytes()).items():
+        (folder / name).write_bytes(content)
+    (folder / "a.b4d").unlink()
+    return folder / "manifest.json"
+
+
+DELIVERY_FREE = frozenset(
+    {"generator", "topology", "bounds", "metadata", "offset", "in UTF-16", *writer.bounds_of(radiant_cloud(3))}
+)
+
+
+def _repacked(content: bytes, name: str, packed: bytes, unpacked: int | None = None, **said: Any) -> bytes:
+    """Return a container with another block, of which the manifest says what is true, but for what is given."""
+    files = unzipped(content)
+    manifest = json.loads(files["manifest.json"])
+    (entry,) = (each for each in (manifest["static"], *manifest["segments"]) if each["file"] == name)
+    was = len(files[name])
+    entry |= {"bytes": len(packed), "sha256": hashlib.sha256(packed).hexdigest()}
+    entry["unpacked"] = len(zlib.decompress(packed)) if unpacked is None else unpacked
+    for other in manifest["segments"]:
+        other["offset"] += len(packed) - was if name == "static.bin" else 0
+    files[name] = packed
+    return zipped({**files, "manifest.json": json.dumps(manifest | said).encode()})
+
+
+def _block(name: str, content: bytes) -> bytes:
+    return zlib.decompress(unzipped(content)[name])
+
+
+def _with_header(block: bytes, header: bytes) -> bytes:
+    old = 4 + struct.unpack_from("<I", block)[0]
+    return struct.pack("<I", len(header)) + header + block[old:]
+
+
+def _deliveries(content: bytes) -> Iterator[Case]:
+    """Containers that lie about sizes, lead elsewhere, or hold blocks that are bombs or break their rules."""
+    for name in ("static.bin", "000000.bin"):
+        block = _block(name, content)
+        end = 4 + struct.unpack_from("<I", block)[0]
+        header = json.loads(block[4:end])
+        for label, size in (("that says so", BOMB_BYTES), ("that lies", len(block))):
+            packed = b"x\x9c" + bomb()
+            yield Case(f"{name} is a bomb {label}", _repacked(content, name, packed, size))
+        for label, other in (("cut", block[:-1]), ("longer", block + b"\0"), ("without a header", block[end:])):
+            yield Case(f"{name} {label}", _repacked(content, name, zlib.compress(other)), is_fatal=label != "longer")
+        for value in (math.nan, math.inf, 1e30):
+            other = block[:end] + struct.pack("<f", value) + block[end + 4 :]
+            yield Case(f"{name} with a weight of {value}", _repacked(content, name, zlib.compress(other)))
+        planes = ([[5], []], [[-1], []], [[], [10**9]], [["1"], []], [[1]], [], None, [[1] * 100_000, []])
+        for which, plane in enumerate(planes):
+            arrays = copy.deepcopy(header["arrays"])
+            arrays[0]["planes"][0] = plane
+            other = _with_header(block, json.dumps({"arrays": arrays}).encode())
+            yield Case(f"{name} with planes {which}", _repacked(content, name, zlib.compress(other)))
+        for label, arrays in (("unknown", [{"name": "a", "planes": []}]), ("twice", 2 * header["arrays"]), ("none", 0)):
+            other = _with_header(block, json.dumps({"arrays": arrays}).encode())
+            yield Case(f"{name} with arrays {label}", _repacked(content, name, zlib.compress(other)))
+    static = unzipped(content)["static.bin"]
+    for count in (0, 1, 2**18, 2**31, -1, 3.0, True):
+        yield Case(f"count {count}", _repacked(content, "static.bin", static, count=count))
+    for file in ("../static.bin", "/dev/zero", "..", "", "a\\b", "\x1b[31m", None):
+        manifest = json.loads(unzipped(content)["manifest.json"])
+        manifest["static"]["file"] = file
+        said = zipped({**unzipped(content), "manifest.json": json.dumps(manifest).encode()})
+        yield Case(f"a block in {file!r}", said)
+
+
 ARCHIVES = {
+    "b4d": Reader(
+        delivery,
+        read_frames,
+        "splats",
+        others=_deliveries,
+        inside=member("manifest.json", Ways(is_json=True, free=DELIVERY_FREE)),
+        free=frozenset({"cut at 90%"}),  # of the archive's directory, which is not needed
+    ),
+    "b4d folder": Reader(delivery_folder, read_frames, "splats", is_json=True, free=DELIVERY_FREE),
     "sog": Reader(
         written("a.sog", 3),
         read_frames,

@@ -74,6 +74,13 @@ class TestStandardError:
         _, stated = least_squares(evidence(np.zeros((4, 10, 3)), noise=0.2))
         np.testing.assert_allclose(stated, 0.01, rtol=1e-6)
 
+    def test_what_gaussians_cannot_show_stays_however_many_views_and_frames_there_are(self):
+        frame = evidence(np.full((16, 10, 3), 0.4))
+        frame.misfit[5:] = 0.03**2
+        solved = solve_base_color(bare(10), frame + frame, IRRADIANCE)
+        np.testing.assert_allclose(solved.standard_error[:5], 0.0, atol=1e-6)
+        np.testing.assert_allclose(solved.standard_error[5:], 0.03, rtol=1e-5)
+
 
 class TestFlags:
     def test_what_one_frame_of_many_shows_is_measured(self):

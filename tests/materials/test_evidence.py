@@ -142,6 +142,20 @@ class TestColors:
         assert found.saturated[clear & ~left].max() < 0.05
         assert (found.colors.numpy()[..., :3].max() < 2.0).all()
 
+    def test_misfit_is_what_pixels_differ_by(self, ball, device):
+        cameras, grey = around(4), colored(ball, np.full((3000, 3), 0.3))
+        checks = 0.05 * (1.0 - 2.0 * (np.indices((SIDE, SIDE)).sum(axis=0) % 2))[..., None]
+        found = view_evidence(grey, cameras, captured(grey, cameras, lambda color: color + checks), device=device)
+        np.testing.assert_allclose(found.misfit[found.seen], 0.05**2, rtol=0.02)
+
+    def test_noise_is_no_misfit(self, ball, device, rng):
+        cameras, grey, step = around(4), colored(ball, np.full((3000, 3), 0.3)), 1e-3
+        views = captured(grey, cameras, lambda color: step * rng.poisson(np.maximum(color, 0.0) / step))
+        found = view_evidence(grey, cameras, views, device=device)
+        shown = found.colors.numpy()[..., 3].sum(axis=0) > 10.0
+        assert shown.sum() > 300
+        assert found.misfit[shown].mean() < 0.4 * step * 0.3  # its own noise, and a level that is known to a fifth
+
     def test_silhouettes_count_for_nothing(self, ball, device):
         cameras = around(2)
         views = [replace(view, color=view.color * 0.0, alpha=view.alpha * 0.5) for view in captured(ball, cameras)]

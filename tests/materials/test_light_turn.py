@@ -7,17 +7,19 @@ import pytest
 from scipy.stats import chi2
 from support.lit_balls import LIGHTS, Ball
 
+from beam_warp.decomposition.capture_light import CaptureLight
 from beam_warp.materials import light_turn
 from beam_warp.materials.light import judge_light, possible_scales
 from beam_warp.materials.light_fits import (
     LEAST_POINTS,
     LIGHT_COLUMNS,
     LIGHT_ROWS,
+    LightEvidence,
     cell_angles,
     cell_directions,
     well_shown,
 )
-from beam_warp.materials.light_turn import LightTurn, find_turn, turned_cells, weaker_explains
+from beam_warp.materials.light_turn import LightTurn, find_turn, missing_light, turned_cells, weaker_explains
 from beam_warp.world.environment import EnvironmentMap
 
 WALL = (-0.6, 0.8, 0.0)
@@ -128,6 +130,41 @@ def test_what_is_beyond_doubt(degrees, error, is_certain):
     assert not LightTurn().is_certain
 
 
+def bunch(light, paint=None, count=200, balls=5):
+    """Evidence of balls of several sizes that do not shade each other: on them, places do not tell normals."""
+    ball = Ball.of(count=count, roughness=1.0)
+    if paint is not None:
+        ball = replace(ball, base_color=paint)
+    one = ball.evidence(light)
+    rows = np.tile(np.arange(count), balls)
+    rng = np.random.default_rng(5)
+    centers = rng.uniform(-6.0, 6.0, (balls, 3)).repeat(count, axis=0)
+    radii = np.geomspace(0.2, 2.0, balls).repeat(count)[:, None]
+    return LightEvidence(
+        positions=(radii * one.positions[rows] + centers).astype(np.float32),
+        normals=one.normals[rows],
+        openness=one.openness[rows],
+        colors=one.colors[:, rows],
+        weights=one.weights[:, rows],
+        directions=one.directions[:, rows],
+    )
+
+
+def cells_of(light):
+    """Power of the cells of a light as stated, ``(L, 3)``."""
+    return turned_cells(light, np.zeros(1))[:, 0]
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+@pytest.mark.parametrize("stated", LIGHTS)
+def test_the_light_of_another_place_is_told(name, stated):
+    """One warning, and no turn that would not mend it; none of the right light, two degrees askew and too bright."""
+    evidence = noisy(bunch(LIGHTS[name]), seed=2)
+    scale = 1.1 * LIGHTS[name].mean_radiance().mean() / LIGHTS[stated].mean_radiance().mean()
+    said = [finding.code for finding in judge_light(evidence, LIGHTS[stated].scaled(scale).rotated(2.0)).findings]
+    assert said == ([] if name == stated else ["environment-unexplained"])
+
+
 @pytest.mark.parametrize("name", LIGHTS)
 def test_less_contrast_explains_more_of_another_light_only(name):
     """The right light, two degrees askew and a tenth too bright, explains; one of more and other contrast does not."""
@@ -144,6 +181,23 @@ def test_less_contrast_explains_more_of_another_light_only(name):
     assert said == ["environment-unexplained"]
 
 
+def test_smooth_light_is_explained_and_paint_is_not():
+    """White times e^(x / 2): most is explained, and its size found. Paint of any kind, and of places: none."""
+    light, rng = LIGHTS["studio"], np.random.default_rng(0)
+    white = well_shown(bunch(light, paint=np.ones((200, 3))))
+    smooth = np.exp(0.5 * white.normals[:, :1])
+    found = missing_light(replace(white, colors=white.colors * smooth), cells_of(light))
+    assert found.gain > 0.7  # half of it
+    assert found.is_certain
+    np.testing.assert_allclose(found.size, 0.5 * white.normals[:, 0].std(), rtol=0.05)
+    spots = well_shown(bunch(light, paint=rng.uniform(0.1, 0.9, (200, 3))))
+    assert not missing_light(spots, cells_of(light)).is_certain
+    faded = np.exp(0.3 * white.positions[:, :1]).astype(np.float32)
+    assert not missing_light(replace(white, colors=white.colors * faded), cells_of(light)).is_certain
+    ball = well_shown(Ball.of(count=800).evidence(light))
+    assert not missing_light(ball, cells_of(LIGHTS["sunset"])).is_certain
+
+
 def test_physics_alone_bounds_the_scale():
     """Paint between 0.1 and 0.8: brighter by a quarter at most, darker until its darkest is a dielectric's surface."""
     ball = Ball.of(count=800, roughness=1.0)
@@ -154,3 +208,14 @@ def test_physics_alone_bounds_the_scale():
     np.testing.assert_allclose(doubled, (2.0 * least, 2.0 * most), rtol=1e-5)
     few = Ball.of(LEAST_POINTS // 2).evidence(LIGHTS["studio"])
     assert np.isnan(possible_scales(few, LIGHTS["studio"])).all()
+
+
+def test_how_far_base_colors_are_known_is_said():
+    """A note with both bounds, beside the warning about a turn; nothing where nothing was asked."""
+    light = LIGHTS["studio"]
+    known = CaptureLight(light, None, 0.0, False, LightTurn(6.0, 1.0), 0.0, (0.2, 0.9))
+    turned, scale = known.findings
+    assert (turned.code, turned.severity) == ("environment-turned", "warning")
+    assert (scale.code, scale.severity) == ("base-color-scale", "note")
+    assert "0.2 to 0.9 times as bright" in str(scale)
+    assert replace(known, turn=LightTurn(), scales=(float("nan"), float("nan"))).findings == []

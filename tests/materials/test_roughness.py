@@ -86,6 +86,7 @@ def profile_of(sky, roughness, device, *, count=800, view_count=20, noise=NOISE,
         0.0 * ones,
         wp.array(colors, dtype=wp.vec4, device=scene.device),
         vectors(np.broadcast_to(directions[:, None], (view_count, count, 3))),
+        np.zeros((count, 3), np.float32),
     )
     light = light_of(sky, str(scene.device))
     profile = measure_roughness_profile(cloud, scene, points, light, views, options=OPTIONS, frame=frame)

@@ -19,6 +19,9 @@ from support.leftovers import temporary_of_the_dead
 from beam_warp import read, validate
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera, read_corrections
+from beam_warp.capture.exposures import CameraExposure, RigExposures, read_exposures
+from beam_warp.capture.mask_corrections import MaskCorrections, read_mask_corrections
+from beam_warp.capture.mattes import MaskOffset
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
@@ -183,8 +186,8 @@ class TestOutputs:
 
         monkeypatch.setattr(CaptureRecord, "view", counted)
         reconstruct(capture, tmp_path / "out", FakeSteps())
-        # Once to inspect the capture, once for fit, tracking and previews, and the first frame for its cameras.
-        assert len(most) == 2 * 3 * len(FRAMES) + 3
+        # Once to inspect the capture, once for fit, tracking and previews, and the first frame for each mend.
+        assert len(most) == 2 * 3 * len(FRAMES) + 3 * 3
         gc.collect()
         assert max(most) <= 2 * 3
         assert not alive
@@ -229,14 +232,14 @@ class TestResuming:
             before_each_write(patch, keep_what_a_kill_leaves)
             reconstruct(capture, tmp_path / "whole", FakeSteps(), options)
         keep_what_a_kill_leaves()
-        # the receipt of the cameras, four writes of each frame, the report, and nothing that is killed
-        assert len(left) == 1 + 4 * 3 + 1 + 1
+        # three receipts of mends, four writes of each frame, the report, and nothing that is killed
+        assert len(left) == 3 + 4 * 3 + 1 + 1
         for done, out in enumerate(left):
             leave_half_written(out)
             steps = FakeSteps()
             found = reconstruct(capture, out, steps, options)
             assert len(steps.calls) == 3 - found.report["resumed_frames"]
-            assert found.report["resumed_frames"] == min((done + 1) // 4, 3)
+            assert found.report["resumed_frames"] == min(max(done - 1, 0) // 4, 3)
             require_same_results(tmp_path / "whole", out)
 
     def test_an_interrupt_changes_no_byte_either(self, followed, capture, tmp_path, monkeypatch):
@@ -245,7 +248,7 @@ class TestResuming:
 
         def interrupt():
             writes.append("begun")
-            if len(writes) == 8:
+            if len(writes) == 10:
                 raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
@@ -434,12 +437,68 @@ class TestCameras:
 
     def test_a_rig_that_moves_is_taken_as_it_is(self, capture, steps, tmp_path):
         moved = [
-            replace(record, camera=moved_camera(record.camera, [0.0] * 5 + [0.1, 0.0])) if record.frame else record
+            replace(record, camera=moved_camera(record.camera, [0.0] * 5 + [0.1, *[0.0] * 3]))
+            if record.frame
+            else record
             for record in capture.records
         ]
         reconstruct(Capture(**{**vars(capture), "records": tuple(moved)}), tmp_path / "out", steps, BEGINNING)
         assert steps.refined == []
 
 
+class TestExposures:
+    """Gains that are found hold for every frame, are kept beside the result, and are not sought twice."""
+
+    FOUND = RigExposures(
+        (CameraExposure("c0", 1.0, gains=(2.0, 2.0, 2.0)), CameraExposure("c1"), CameraExposure("c2")),
+        exposure_undone=True,
+    )
+
+    def test_frames_are_fitted_to_corrected_colours(self, capture, tmp_path):
+        steps = FakeSteps()
+        steps.exposures = self.FOUND
+        found = reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        for before, after in zip(capture.select(frames={1}), found.capture.select(frames={1}), strict=True):
+            factor = 2.0 if before.camera_name == "c0" else 1.0
+            np.testing.assert_array_equal(factor * after.view().color, before.view().color)
+        assert found.report["exposures"] == self.FOUND.as_dict()
+        assert "camera-exposure" in {finding["code"] for finding in found.report["findings"]}
+        assert read_exposures(tmp_path / "out") == self.FOUND
+        again = FakeSteps()  # would find nothing
+        assert reconstruct(capture, tmp_path / "out", again, BEGINNING).report["exposures"] == self.FOUND.as_dict()
+        assert again.calls == []
+        kept = reconstruct(capture, tmp_path / "out", steps, replace(BEGINNING, exposures="keep"))
+        assert kept.capture is capture
+        assert read_exposures(tmp_path / "out") is None
+
+
 def down_of(camera):
     return camera.camera_to_world[:3, 1]
+
+
+class TestMasks:
+    """What is found about masks holds for every frame, is kept beside the result, and is not sought twice."""
+
+    FOUND = MaskCorrections({"c1": MaskOffset(-0.7, 0.1)})
+
+    def test_frames_are_fitted_to_moved_masks(self, capture, tmp_path):
+        steps, again = FakeSteps(), FakeSteps()
+        steps.masks = self.FOUND
+        found = reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        assert steps.mended == [("c0", "c1", "c2")]
+        assert found.report["masks"] == self.FOUND.as_dict()["cameras"]
+        assert "mask-offset" in {finding["code"] for finding in found.report["findings"]}
+        excess = {record.camera_name: record.mask_excess for record in found.capture.records}
+        assert excess == {"c0": 0.0, "c1": -0.7, "c2": 0.0}
+        assert read_mask_corrections(tmp_path / "out") == self.FOUND
+        assert reconstruct(capture, tmp_path / "out", again, BEGINNING).report["masks"] == found.report["masks"]
+        assert (again.mended, again.calls) == ([], [])
+
+    def test_masks_are_kept_if_asked_for(self, capture, tmp_path):
+        steps = FakeSteps()
+        steps.masks = self.FOUND
+        reconstruct(capture, tmp_path / "out", steps, BEGINNING)
+        found = reconstruct(capture, tmp_path / "out", steps, replace(BEGINNING, masks="keep"))
+        assert len(steps.mended) == 1
+        assert found.capture is capture
+        assert read_mask_corrections(tmp_path / "out") is None

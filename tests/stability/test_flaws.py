@@ -9,7 +9,7 @@ from PIL import Image as PillowImage
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import srgb_to_linear
-from beam_warp.stability.flaws.mattes import offset_coverage
+from beam_warp.stability.flaws.mattes import blotted_coverage, offset_coverage
 from beam_warp.stability.flaws.optics import defocused, distorted, motion_blurred, radial_coefficient
 from beam_warp.stability.flaws.rig import CameraFlaws, draw_camera_flaws
 from beam_warp.stability.flaws.sensor import FULL_WELL, READ_NOISE, noisy
@@ -98,6 +98,14 @@ class TestMattes:
         assert (alpha <= larger).all()
         np.testing.assert_array_equal(offset_coverage(alpha, 0.0), alpha)
         np.testing.assert_array_equal(offset_coverage(np.zeros((8, 8)), 2.0), 0.0)
+
+    def test_blots_are_a_hole_and_a_blob(self):
+        alpha = np.zeros((64, 64))
+        alpha[20:44, 20:44] = 1.0
+        blotted = blotted_coverage(alpha, 8.0, np.random.default_rng(0))
+        hole, blob = ((blotted - alpha) == value for value in (-1.0, 1.0))
+        assert 0.3 * 16.0 * np.pi < hole.sum() <= 57  # of whole pixels; cut by the outline, perhaps
+        assert 0.3 * 16.0 * np.pi < blob.sum() <= 57
 
 
 class TestSensor:
@@ -222,6 +230,22 @@ class TestWrite:
             assert np.abs(mine.color[solid] - clean.color[solid] / copy.white).max() < step + 5 * 0.01 * 0.021
             assert np.abs(mine.alpha - clean.alpha).max() <= 0.5 / 255 + 1e-6
         assert PillowImage.open(copy.capture.records[0].image_path).mode == "RGBA"
+
+    @pytest.mark.parametrize("size", [1.0, 2.0])
+    def test_cut_outs_keep_straight_colour_within_wrong_masks(self, flawed, tiny_capture, size):
+        copy = flawed("cutouts", size=size)
+        for record, (mine, clean) in zip(copy.capture.records, views(copy.capture, tiny_capture), strict=True):
+            way = copy.injected["cameras"][record.camera_name]["mask_pixels"]
+            assert abs(way) == size
+            assert np.sign(mine.alpha.sum() - clean.alpha.sum()) == np.sign(way)
+            assert mine.color[clean.alpha == 0.0].max() == 0.0
+            solid = (mine.alpha > 0.999) & (clean.alpha > 0.999)
+            np.testing.assert_allclose(mine.color[solid], clean.color[solid], rtol=2.0**-10, atol=1e-6)
+
+    def test_blots_are_in_a_quarter_of_the_masks(self, flawed, tiny_capture):
+        copy = flawed("blots", "plate", size=0.5)
+        found = [np.abs(mine.alpha - clean.alpha).max() > 0.9 for mine, clean in views(copy.capture, tiny_capture)]
+        assert 0 < sum(found) < 0.6 * len(found)
 
     def test_light_is_turned_and_brighter(self, flawed, tiny_capture):
         copy = flawed("light", size=2.0)

@@ -4,8 +4,16 @@ import numpy as np
 
 from beam_warp.materials.direct import ColorEvidence
 
-VECTORS = ("numerator", "denominator", "observed", "irradiance")
-MEASURED = {"irradiance": 1.0, "openness": 1.0, "noise": 0.0, "facing": 1.0, "saturated": 0.0, "unseen": 0.0}
+VECTORS = ("numerator", "denominator", "observed", "irradiance", "misfit")
+MEASURED = {
+    "irradiance": 1.0,
+    "openness": 1.0,
+    "noise": 0.0,
+    "misfit": 0.0,
+    "facing": 1.0,
+    "saturated": 0.0,
+    "unseen": 0.0,
+}
 
 
 def color_evidence(count, **given):

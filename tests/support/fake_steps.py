@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from support.shapes import cloud_of, sphere_points, tiles
 
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.files import write_exr
 from beam_warp.raster.records import RasterOptions
@@ -69,18 +70,29 @@ class FakeSteps:
     device = "cpu"
     raster = RasterOptions(antialiased=True)
     rig = None
+    masks = MaskCorrections()
+    exposures = None
 
     def __init__(self, count=60, seed=0):
         self.count, self.seed = count, seed
-        self.calls, self.refined, self.cameras = [], [], []
+        self.calls, self.refined, self.mended, self.cameras = [], [], [], []
 
     def options(self):
         return {"count": self.count, "seed": self.seed}
+
+    def mend_masks(self, names, views, progress):
+        """What the test says, in ``masks``."""
+        self.mended.append(tuple(names))
+        return self.masks
 
     def refine_rig(self, names, views, progress):
         """What the test says, in ``rig``."""
         self.refined.append(tuple(names))
         return self.rig
+
+    def find_exposures(self, names, views, progress):
+        """What the test says, in ``exposures``."""
+        return self.exposures
 
     def begin(self, views, progress):
         level = self.level(views)

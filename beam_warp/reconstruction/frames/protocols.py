@@ -9,6 +9,8 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from beam_warp.capture.corrections import RigCorrection
+from beam_warp.capture.exposures import RigExposures
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.gaussians import GaussianCloud
@@ -57,10 +59,22 @@ class FrameSteps(Protocol):
         """Return all that results depend on, but for the device; JSON-able."""
         ...
 
+    def mend_masks(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> MaskCorrections:
+        """Find how far the masks of the cameras that have these names and took these views are off."""
+        ...
+
     def refine_rig(
         self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
     ) -> RigCorrection | None:
         """Find what is wrong with the cameras that these names have and took these views; None for nothing to say."""
+        ...
+
+    def find_exposures(
+        self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
+    ) -> RigExposures | None:
+        """Find exposures and white balances of the cameras that took these views; None for nothing to say."""
         ...
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[FrameTrack, dict[str, Any]]:

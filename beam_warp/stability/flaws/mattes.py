@@ -1,10 +1,12 @@
-"""What a studio cuts the subject out with: masks that are a little too large or too small, before an even backdrop."""
+"""What a studio cuts the subject out with: masks a little too large or small, or blotted, before an even backdrop."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import shift
+from scipy.ndimage import distance_transform_edt, shift
 
 DIRECTIONS = 24
 RADIUS_STEP = 0.5
@@ -35,6 +37,28 @@ def offset_coverage(alpha: NDArray[np.float64], pixels: float) -> NDArray[np.flo
         for way in radius * ways:
             np.maximum(grown, shift(alpha, way, order=1, mode="nearest"), out=grown)
     return grown
+
+
+def blotted_coverage(
+    alpha: NDArray[np.float64], diameter: float, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return a mask with a round hole in the subject and a round blob beside it.
+
+    Args:
+        alpha: Coverage in [0, 1], ``(H, W)``.
+        diameter: Of both [pixel].
+        generator: Draws where: the hole somewhere within, the blob where the subject is as near as it is wide.
+    """
+    rows, columns = np.indices(alpha.shape)
+    away: Any = distance_transform_edt(alpha == 0.0)  # its types say that it may be None
+    near = (alpha == 0.0) & (away < 2.0 * diameter)
+    blotted = alpha.copy()
+    for places, value in ((alpha == 1.0, 0.0), (near, 1.0)):
+        found = np.argwhere(places)
+        if len(found):
+            row, column = found[generator.integers(len(found))]
+            blotted[np.hypot(rows - row, columns - column) <= 0.5 * diameter] = value
+    return blotted
 
 
 def plate(shape: tuple[int, int], radiance: NDArray[np.float64], generator: np.random.Generator) -> NDArray[np.float64]:

@@ -106,7 +106,7 @@ def draw_camera_flaws(
         put("exposure_stops", (EXPOSURE_STOPS * size * levels(count, stream(seed, "exposure"))).tolist())
         red, blue = (WHITE_BALANCE * size * levels(count, stream(seed, hue)) for hue in ("red", "blue"))
         put("white_balance", list(zip(red.tolist(), blue.tolist(), strict=True)))
-    if "masks" in flaws:
+    if "masks" in flaws or "cutouts" in flaws:
         put("mask_pixels", (MASK_PIXELS * size * _signs(count, stream(seed, "masks"))).tolist())
     if "poses" in flaws:
         generator = stream(seed, "poses")

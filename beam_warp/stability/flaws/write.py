@@ -3,7 +3,8 @@
 The copy holds what a studio delivers: images of the training cameras, masks, calibration, and the light as measured.
 Where coverage is right, images hold the subject alone, keyed out: straight colour and coverage. Where it is not, they
 are photographs of the subject before a grey wall, without coverage, and masks lie beside them: a mask that is too large
-shows some of the wall, and nothing in the copy tells where the subject ends but the pictures themselves.
+shows some of the wall, and nothing in the copy tells where the subject ends but the pictures themselves. Cut-outs alone
+have straight colour over nothing, and wrong coverage.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from beam_warp.checks import require_choice, require_number
 from beam_warp.demo.capture import replacing_folder, transforms_record
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.files import write_exr, write_png
-from beam_warp.stability.flaws.mattes import PLATE_ALBEDO, offset_coverage, plate
+from beam_warp.stability.flaws.mattes import PLATE_ALBEDO, blotted_coverage, offset_coverage, plate
 from beam_warp.stability.flaws.optics import defocused, distorted, motion_blurred
 from beam_warp.stability.flaws.rig import CameraFlaws, draw_camera_flaws, stream
 from beam_warp.stability.flaws.sensor import eight_bits, noisy, straight, write_eight_bits, write_jpeg, write_linear
@@ -33,19 +34,23 @@ LIGHT_DEGREES = 2.0
 LIGHT_GAIN = 0.1
 BLUR_PIXELS = 1.0
 DEFOCUS_PIXELS = 2.0
+BLOT_PIXELS, BLOTTED_PART = 8.0, 0.25
 CLIPPED_PART = 0.02
 JPEG_LOSS = 10
 MISSING_CAMERAS = 2
 HEADROOM = 1e-3
-"""Nominal sizes: turn and gain of the light, way of the subject during an exposure, circle of confusion, part of the
-subject's pixels that are clipped, quality that a JPEG lacks to 100, and cameras that lack one image. `HEADROOM` is the
-part of the subject's pixels above white where highlights are meant to be kept."""
+"""Nominal sizes: turn and gain of the light, way of the subject during an exposure, circle of confusion, diameter of
+blots and part of the masks that have them, part of the subject's pixels that are clipped, quality that a JPEG lacks to
+100, and cameras that lack one image. `HEADROOM` is the part of the subject's pixels above white where highlights are
+meant to be kept."""
 
 FLAWS: Mapping[str, str] = {
     "exposure": "exposure up to 0.2 stop and white balance up to 5 % off, a camera",
     "noise": "photon noise of 2 % at white, read noise of 0.2 %, 8-bit sRGB PNG",
     "plate": "photographs before a grey wall, with exact masks",
     "masks": "masks one pixel too large in half of the cameras, too small in the others, before a grey wall",
+    "blots": "a hole and a blob, eight pixels across, in a quarter of the masks, before a grey wall",
+    "cutouts": "cut-outs, colour over nothing, one pixel too large in half of the cameras, too small in the others",
     "poses": "poses off by 0.3 pixel of rotation and 1 mm",
     "light": "environment turned by 2° and 10 % too bright",
     "motion-blur": "the subject moves by a pixel while the shutter is open",
@@ -179,7 +184,7 @@ class _Shot:
     @property
     def is_photograph(self) -> bool:
         """Whether images show the wall, and masks lie beside them."""
-        return not self.flaws.isdisjoint(("plate", "masks", "jpeg"))
+        return not self.flaws.isdisjoint(("plate", "masks", "blots", "jpeg"))
 
     def files(self, record: CaptureRecord) -> dict[str, str]:
         """Return the names of a record's files, as ``transforms.json`` has them."""
@@ -203,11 +208,15 @@ class _Shot:
         flaws = self.cameras[record.camera_name]
         layers = self._seen(record, flaws)
         alpha = layers[..., 3]
+        if "cutouts" in self.flaws and not self.is_photograph:
+            coverage = offset_coverage(alpha, flaws.mask_pixels)
+            layers = np.dstack([straight(layers) * coverage[..., None], coverage])
+            alpha = coverage
         color = layers[..., :3] if not self.is_encoded else straight(layers)
         if self.is_photograph:
             wall = plate(alpha.shape, self.wall, stream(self.seed, "plate", record.camera_name))
             color = layers[..., :3] + (1.0 - alpha[..., None]) * wall
-            coverage = offset_coverage(alpha, flaws.mask_pixels)
+            coverage = self._blotted(offset_coverage(alpha, flaws.mask_pixels), record)
             write_png(paths["mask_path"], eight_bits(coverage))
         light = self._counted(color * flaws.gains, record)
         if "jpeg" in self.flaws:
@@ -230,6 +239,13 @@ class _Shot:
             layers = defocused(layers, DEFOCUS_PIXELS * self.size)
         layers[..., 3] = np.clip(layers[..., 3], 0.0, 1.0)  # filters and splines overshoot beside edges
         return np.maximum(layers, 0.0)
+
+    def _blotted(self, coverage: NDArray[np.float64], record: CaptureRecord) -> NDArray[np.float64]:
+        """Return a mask with pixels in the wrong, if it is one that has some."""
+        generator = stream(self.seed, "blots", record.name)
+        if "blots" not in self.flaws or generator.uniform() > BLOTTED_PART:
+            return coverage
+        return blotted_coverage(coverage, BLOT_PIXELS * self.size, generator)
 
     def _counted(self, light: NDArray[np.float64], record: CaptureRecord) -> NDArray[np.float64]:
         """Return what the sensor counts of light, in the clean capture's units."""

@@ -1,0 +1,330 @@
+"""Exposures and white balances of a rig's cameras, from what they show of the same points of the surface.
+
+A photograph of a matte surface tells its camera's gains; gloss does not look alike from everywhere, and shifts what a
+camera seems to be off by. Where the light of a capture is known, gloss is known but for its roughness:
+
+    c[v, i] = g[v] (d[i] + sum over k of w[i, k] s[k, v, i])
+
+with the colour c that view v shows of point i, its gains g, the point's diffuse colour d, and the highlight s that a
+smooth surface there would show at roughness k: the light, blurred by the lobe, in the mirrored direction, times the
+specular albedo of a dielectric. A material of one roughness that nothing hides has a weight w of 1 for it and 0 for
+others. So the prior of the weights is normal with the mean and covariance of such a choice, whose probabilities all
+points share: what is left to 1 is hidden. All begin alike, and are then the mean of the points' weights. Gains are
+those of least squares with all points' unknowns eliminated. Each point has a deviation of its own, so that fine
+texture, and places where the surface is wrong, count little.
+
+How sure the gains are is asked twice. The bright and the dark half of the points must tell the same, for gloss is a
+larger part of what a dark point shows: half of their difference is as large as the error. And of what the model of
+gloss changes, half may be wrong. Exposures and white balances stay as they are unless they are beyond that (an F test
+of the mean squares), each on its own evidence. Then they shrink by what the error explains of them. So a sound capture
+stays as it is, to the bit. The mean over the cameras is held.
+
+Sources: empirical Bayes, Efron and Morris 1973; random effects, Laird and Ware 1982; Cauchy's weights, Holland and
+Welsch 1977; the split sum, Karis 2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from beam_warp.capture.exposures import CameraExposure, RigExposures
+from beam_warp.capture.views import CapturedView
+from beam_warp.device.arrays import resolve_device
+from beam_warp.image.color import LUMINANCE
+from beam_warp.jobs.listeners import no_progress
+from beam_warp.light.ggx import specular_albedo
+from beam_warp.light.prefiltered import LEVEL_ROUGHNESS, blurred_environment
+from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
+from beam_warp.reconstruction.frames.protocols import StepProgress
+from beam_warp.reconstruction.initial import initial_gaussians, view_samples
+from beam_warp.reconstruction.track import outward_normals
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud
+
+FEWEST_CAMERAS = 6
+"""Fewest cameras that are compared."""
+
+LEVELS = (2, 5, 7, 9, 11)
+"""Levels of `LEVEL_ROUGHNESS` whose highlights explain those of all others about: roughness 0.15 to 0.83."""
+
+COSINES = np.linspace(0.0, 1.0, 65)
+"""Cosines between which specular albedos are interpolated."""
+
+NEIGHBORS = 8
+"""Gaussians over which normals are averaged."""
+
+CHANCE = 1e-3
+"""Probability below which differences of gains are not chance."""
+
+MOST_POINTS = 1_024
+"""Most points that are compared, evenly chosen."""
+
+FEWEST_POINTS = 64
+"""Fewest points that tell gains."""
+
+LEAST_VIEWS = 4
+"""Views that a point is seen by at least: three numbers of its own are found."""
+
+DARKEST = 0.03
+"""Part of the median colour below which a point is left out: its noise and what it mirrors are as large as itself."""
+
+ROUNDS = 30
+"""Rounds of least squares at most."""
+
+SETTLED = 2e-4
+"""Change of the gains' logarithms at which rounds end."""
+
+LEAST_CHANCE, LEAST_VARIANCE = 0.01, 1e-4
+"""Least chance of a roughness, so that none is ruled out for good, and what keeps covariances from being singular."""
+
+LEAST_SPREAD = 0.01
+"""Least standard deviation of a colour that is assumed, of itself: that of eight bits and of filters."""
+
+FIT_GAUSSIANS = 10_000
+"""Most Gaussians of the surface at which views are compared."""
+
+LARGEST_SIDE = 320
+"""Pixels of a side at which views are compared, about."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedGains:
+    """Natural logarithms of the gains of views, each of mean 0 over the views, ``(V, 3)``.
+
+    Attributes:
+        logs: Of red, green and blue.
+        apart: Half the difference of what the bright and the dark half of the points tell.
+        gloss: Half of what the model of gloss changes.
+    """
+
+    logs: NDArray[np.float64]
+    apart: NDArray[np.float64]
+    gloss: NDArray[np.float64]
+
+    def error(self, what: NDArray[np.float64]) -> float:
+        """Return the standard error, root mean square, of linear functions of the logarithms, ``(3, k)``."""
+        return float(np.sqrt(np.mean(np.square(self.apart @ what)) + np.mean(np.square(self.gloss @ what))))
+
+
+def find_exposures(
+    names: Sequence[str],
+    views: Sequence[CapturedView],
+    environment: EnvironmentMap,
+    options: FitOptions,
+    *,
+    device: str | None = None,
+    progress: StepProgress = no_progress,
+) -> RigExposures | None:
+    """Find exposures and white balances of the cameras of a rig.
+
+    Args:
+        names: Names of the cameras.
+        views: The photograph of each of them at one moment, with masks.
+        environment: The light of the capture, in units of the photographs.
+        options: How key frames are fitted.
+        device: Warp device; None takes the first CUDA device, or the CPU.
+        progress: Called with (done, total, facts), in steps.
+
+    Returns:
+        What was found; None where there are fewer than `FEWEST_CAMERAS`, a view has no mask, or the views share too
+        little.
+
+    Raises:
+        InvalidArrayError: The masks have no volume in common.
+        DeviceError: There is no such device.
+    """
+    if len(views) < FEWEST_CAMERAS or any(view.alpha is None for view in views):
+        return None
+    reduced = [view.reduced(max(1, min(view.camera.width, view.camera.height) // LARGEST_SIDE)) for view in views]
+    cloud, normals = _surface(reduced, options, device, progress)
+    samples = view_samples(reduced, cloud, normals, device=device).numpy()
+    rows = np.flatnonzero(((samples[..., 3] > 0.0).sum(axis=0) >= LEAST_VIEWS) & normals.any(axis=1))
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 2 * MOST_POINTS)).astype(int)]
+    positions = cloud.positions[rows].astype(np.float64)
+    away = np.stack([view.camera.position for view in views])[:, None] - positions
+    away /= np.linalg.norm(away, axis=2, keepdims=True)
+    gloss = highlights(normals[rows].astype(np.float64), away, environment, device)
+    solved = solve_gains(samples[:, rows], gloss)
+    return None if solved is None else judged(names, solved)
+
+
+def _surface(
+    views: Sequence[CapturedView], options: FitOptions, device: str | None, progress: StepProgress
+) -> tuple[GaussianCloud, NDArray[np.float32]]:
+    """Return Gaussians that a quick fit brings to the surface, and their normals, 0 where these are not known."""
+    count = min(options.gaussian_count, FIT_GAUSSIANS)
+    start = initial_gaussians(views, count, device=device, seed=options.seed)
+    fitting = FitOptions.of_preset("draft", gaussian_count=count, raster=options.raster, samples=1, seed=options.seed)
+    cloud = fit_gaussians(views, start, fitting, device=device, progress=progress).cloud
+    outward = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])
+    nearest = cKDTree(start.positions).query(cloud.positions, workers=-1)[1]
+    normals = outward_normals(cloud, outward[nearest])
+    near = cKDTree(cloud.positions).query(cloud.positions, k=min(NEIGHBORS, len(cloud)), workers=-1)[1]
+    mean = normals[near.reshape(len(cloud), -1)].sum(axis=1)
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    return cloud, np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.0)
+
+
+def highlights(
+    normals: NDArray[np.float64], away: NDArray[np.float64], environment: EnvironmentMap, device: Any = None
+) -> NDArray[np.float64]:
+    """Return what smooth dielectric surfaces mirror of a light that nothing hides.
+
+    Args:
+        normals: Unit normals, ``(N, 3)``.
+        away: Unit directions towards the views, ``(V, N, 3)``.
+        environment: The light.
+        device: Warp device that blurs it; None takes the first CUDA device, or the CPU.
+
+    Returns:
+        Radiance for each roughness of `LEVELS`, ``(V, N, 3, K)``; 0 from behind.
+    """
+    cosine = (away * normals).sum(axis=2)
+    x, y, z = np.moveaxis(2.0 * cosine[..., None] * normals - away, 2, 0)
+    u, v = 0.5 - np.arctan2(y, x) / (2.0 * np.pi), np.arccos(np.clip(z, -1.0, 1.0)) / np.pi
+    light = blurred_environment(environment, resolve_device(device))
+    texels, heights, offsets = light.texels.numpy(), light.heights.numpy(), light.offsets.numpy()
+    seen = []
+    for level in LEVELS:
+        rows = int(heights[level])
+        image = texels[offsets[level] : offsets[level] + 2 * rows * rows].reshape(rows, 2 * rows, 3)
+        place = np.stack([np.clip(v * rows - 0.5, 0.0, rows - 1.0), u * 2 * rows - 0.5])
+        albedo = np.interp(cosine, COSINES, specular_albedo(COSINES, LEVEL_ROUGHNESS[level]))
+        mirrored = [map_coordinates(image[..., hue], place, order=1, mode="grid-wrap") for hue in range(3)]
+        seen.append(np.stack(mirrored, axis=-1) * (albedo * (cosine > 0.0))[..., None])
+    return np.stack(seen, axis=-1)
+
+
+def solve_gains(samples: NDArray[np.floating], gloss: NDArray[np.floating]) -> SolvedGains | None:
+    """Solve for the gains of views.
+
+    Args:
+        samples: Scene-linear colour and weight of each point in each view, 0 where it is not seen, ``(V, N, 4)``.
+        gloss: Highlights of a smooth dielectric for each roughness, ``(V, N, 3, K)``.
+
+    Returns:
+        The gains, 0 of views that share nothing with others; None where there are fewer than `FEWEST_POINTS`.
+    """
+    colors, weights = samples[..., :3].astype(np.float64), samples[..., 3].astype(np.float64)
+    weights = np.where(colors.min(axis=2) > 0.0, weights, 0.0)
+    totals = weights.sum(axis=0)
+    means = (colors * weights[..., None]).sum(axis=0) / np.maximum(totals, 1e-300)[:, None]
+    known = (weights > 0.0).sum(axis=0) >= LEAST_VIEWS
+    known &= (means > DARKEST * np.median(means[known], axis=0)).all(axis=1) if known.any() else known
+    rows = np.flatnonzero(known)
+    if len(rows) < FEWEST_POINTS:
+        return None
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int)]
+    scale = means[rows, None, :]
+    relative, seen = colors[:, rows].transpose(1, 0, 2) / scale, weights[:, rows].T
+    shine = gloss[:, rows].transpose(1, 0, 2, 3) / scale[..., None]
+    logs = _Solver(relative, seen, shine).solve()
+    matte = _Solver(relative, seen, shine[..., :0]).solve()
+    levels = means[rows] @ LUMINANCE
+    is_bright = levels > np.median(levels)
+    bright, dark = (_Solver(relative[half], seen[half], shine[half]).solve() for half in (is_bright, ~is_bright))
+    return SolvedGains(logs, 0.5 * (bright - dark), 0.5 * (logs - matte))
+
+
+class _Solver:
+    """Rounds of least squares over points, ``(N,)``, and the channels of views, ``(3 V,)``."""
+
+    def __init__(self, colors: NDArray[np.float64], weights: NDArray[np.float64], gloss: NDArray[np.float64]) -> None:
+        count, views, _, kinds = gloss.shape
+        self._colors = colors.reshape(count, -1)
+        self._weights = np.repeat(weights, 3, axis=1)
+        own = np.broadcast_to(np.tile(np.eye(3), (views, 1)), (count, 3 * views, 3))
+        self._basis = np.concatenate([own, gloss.reshape(count, 3 * views, kinds)], axis=2)
+        self._chances = np.full(kinds, 1.0 / (kinds + 1))
+        self._factors = self._weights / LEAST_SPREAD**2
+        self._logs = np.zeros(3 * views)
+        self._known = np.flatnonzero(self._weights.any(axis=0))
+        shared = max(len(self._known) // 3, 1)
+        self._held = np.eye(3 * shared) - np.kron(np.full((shared, shared), 1.0 / shared), np.eye(3))
+
+    def solve(self) -> NDArray[np.float64]:
+        """Return the logarithms of the gains, ``(V, 3)``; 0 of views that see nothing."""
+        for _ in range(ROUNDS):
+            matrix, right = self._round()
+            among = self._held @ matrix[np.ix_(self._known, self._known)] @ self._held
+            change = np.linalg.lstsq(among, self._held @ right[self._known], rcond=1e-9)[0]
+            self._logs[self._known] += change
+            if np.abs(change).max(initial=0.0) < SETTLED:
+                break
+        return self._logs.reshape(-1, 3)
+
+    def _round(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return normal equations for a change of the gains, the points' unknowns eliminated at the gains so far.
+
+        Then the chances of roughnesses and the weights are brought up to date.
+        """
+        basis = self._basis * np.exp(self._logs)[None, :, None]
+        weighted = basis * self._factors[..., None]
+        precision = np.diag(np.full(basis.shape[2], 1e-9))
+        precision[3:, 3:] = np.linalg.inv(
+            np.diag(self._chances + LEAST_VARIANCE) - np.outer(self._chances, self._chances)
+        )
+        spread = np.linalg.inv(weighted.transpose(0, 2, 1) @ basis + precision)
+        given = np.concatenate([np.zeros(3), precision[3:, 3:] @ self._chances])
+        found = spread @ (weighted.transpose(0, 2, 1) @ self._colors[..., None] + given[:, None])
+        model = (basis @ found)[..., 0]
+        left = self._colors - model
+        explained = (weighted * model[..., None]) @ np.linalg.cholesky(spread)
+        rows = explained.transpose(0, 2, 1).reshape(-1, model.shape[1])
+        matrix = np.diag((self._factors * model**2).sum(axis=0)) - rows.T @ rows
+        right = (self._factors * model * left).sum(axis=0)
+        self._learn(found[:, 3:, 0], left)
+        return matrix, right
+
+    def _learn(self, found: NDArray[np.float64], left: NDArray[np.float64]) -> None:
+        """Take the chances of roughnesses and the weights of samples from points' weights of gloss and what is left."""
+        chances = np.maximum(found.mean(axis=0), LEAST_CHANCE)
+        self._chances = chances / max(float(chances.sum()), 1.0)
+        off = np.abs(left) * np.sqrt(self._weights)
+        middle = np.nanmedian(np.where(self._weights > 0.0, off, np.nan), axis=1, keepdims=True)
+        deviation = np.maximum(1.4826 * middle, LEAST_SPREAD)
+        self._factors = self._weights / (deviation**2 + off**2)
+
+
+def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
+    """Return the exposures and white balances of cameras, undone as far as they are beyond chance.
+
+    Args:
+        names: Names of the cameras.
+        solved: Their gains.
+    """
+    mean = np.full((3, 1), 1.0 / 3.0)
+    rest = np.eye(3) - 1.0 / 3.0
+    exposures, balances = solved.logs @ mean, solved.logs @ rest
+    exposure_error, balance_error = solved.error(mean), solved.error(rest)
+    kept = _part_beyond_chance(exposures, exposure_error, len(names) - 1)
+    kept_balance = _part_beyond_chance(balances, balance_error, 2 * (len(names) - 1))
+    gains = np.exp(kept * exposures + kept_balance * balances)
+    stops = exposures[:, 0] / np.log(2.0)
+    return RigExposures(
+        tuple(
+            CameraExposure(name, float(stop), tuple(balance.tolist()), tuple(gain.tolist()))
+            for name, stop, balance, gain in zip(names, stops, balances, gains, strict=True)
+        ),
+        exposure_error=exposure_error / float(np.log(2.0)),
+        balance_error=balance_error,
+        exposure_undone=kept > 0.0,
+        balance_undone=kept_balance > 0.0,
+    )
+
+
+def _part_beyond_chance(found: NDArray[np.float64], error: float, freedom: int) -> float:
+    """Return the part of what was found that an error does not explain: 0 unless an F test says that it is not all."""
+    signal = float(np.mean(np.square(found)))
+    if not signal > error**2 * stats.f.isf(CHANCE, freedom, freedom):
+        return 0.0
+    return 1.0 - error**2 / signal

@@ -1,0 +1,47 @@
+"""What the page on delivery says of sizes, errors and speed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tables import Row, Rows, cell, table
+
+DELIVERY = "delivery_cpu.json"
+
+
+@table("delivery_takes", DELIVERY)
+def takes(result: Row) -> Rows:
+    """Return the containers of a take: size, errors root mean square, relit loss, and time to decode a frame."""
+    head = ["Gaussians", "error scale", "KB a frame", "moving", "position [mm]", "orientation", "normal"]
+    rows: list[list[Any]] = [
+        [*head, "occlusion", "relit [dB]", "loss [dB]", "NumPy [ms]", "Node.js [ms]", "written [s a frame]"]
+    ]
+    for row in result["takes"]["rows"]:
+        errors = row["errors"]
+        rows.append(
+            [
+                f"{row['gaussians']:,}",
+                f"{row['factor']:g}",
+                cell(row["kb_a_frame"], ".0f"),
+                cell(row["moving_kb_a_frame"], ".0f"),
+                cell(errors["position_mm"]["rms"], ".2f"),
+                f"{cell(errors['turn_degrees']['rms'], '.2f')}°",
+                f"{cell(errors['normal_degrees']['rms'], '.2f')}°",
+                cell(errors["occlusion"]["rms"], ".3f"),
+                cell(min(row["relit_psnr"].values()), ".1f"),
+                cell(row["relit_loss_db"], ".2f"),
+                cell(row["numpy_ms"]["all"], ".1f"),
+                cell(row["node_ms"] and row["node_ms"]["all"], ".1f"),
+                cell(row["write_seconds_a_frame"], ".2f"),
+            ]
+        )
+    return rows
+
+
+@table("delivery_codecs", DELIVERY)
+def codecs(result: Row) -> Rows:
+    """Return how small a segment becomes by each codec, and how long unpacking takes, a frame."""
+    rows: list[list[Any]] = [["codec", "native in", "KB a frame", "unpacked [ms a frame]"]]
+    for row in result["codecs"]["rows"]:
+        rows.append([row["name"], row["native"], cell(row["kb_a_frame"], ".1f"), cell(row["ms"], ".2f")])
+    return rows

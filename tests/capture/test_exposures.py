@@ -1,0 +1,60 @@
+"""Exposures of cameras: which records they touch, what a view is then, what is said of them, and their file."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.fake_steps import write_capture
+
+from beam_warp.capture.capture import Capture
+from beam_warp.capture.exposures import FILE_NAME, CameraExposure, RigExposures, read_exposures
+from beam_warp.errors import AssetFormatError
+
+FOUND = RigExposures(
+    (
+        CameraExposure("c0", 0.2, (0.03, -0.01, -0.02), (1.25, 1.0, 0.8)),
+        CameraExposure("c1", -0.1, (0.0, 0.01, -0.01), (0.9, 0.9, 0.9)),
+        CameraExposure("c2"),
+    ),
+    exposure_error=0.03,
+    balance_error=0.004,
+    exposure_undone=True,
+    balance_undone=True,
+)
+
+
+def test_views_of_training_records_are_without_the_gains(tmp_path):
+    capture = Capture.read(write_capture(tmp_path / "ball", (0,)))
+    records = (*capture.records, replace(capture.records[0], split="test"))
+    corrected = FOUND.corrected(records)
+    for before, after in zip(records, corrected, strict=True):
+        gains = {"c0": (1.25, 1.0, 0.8), "c1": (0.9, 0.9, 0.9), "c2": (1.0, 1.0, 1.0)}[before.camera_name]
+        gains = gains if before.split == "train" else (1.0, 1.0, 1.0)
+        np.testing.assert_allclose(after.view().color * gains, before.view().color, rtol=1e-6)
+        np.testing.assert_array_equal(after.view().alpha, before.view().alpha)
+    assert corrected[2] is records[2]
+    assert corrected[3] is records[3]
+
+
+def test_findings_say_how_much_and_who_most():
+    exposure, balance = FOUND.findings()
+    assert (exposure.code, exposure.where) == ("camera-exposure", "c0")
+    assert "differ by 0.13 ± 0.03 stops, at most +0.20" in exposure.what
+    assert (balance.code, balance.where) == ("camera-white-balance", "c0")
+    assert "differ by 1.3 ± 0.4 %, at most 3.0 %" in balance.what
+    assert replace(FOUND, exposure_undone=False, balance_undone=False).findings() == []
+
+
+def test_files_come_back_and_damage_is_named(tmp_path):
+    assert read_exposures(tmp_path) is None
+    path = tmp_path / FILE_NAME
+    path.write_text(json.dumps({"key": "k", **FOUND.as_dict()}))
+    assert read_exposures(tmp_path) == FOUND
+    assert read_exposures(tmp_path, "k") == FOUND
+    assert read_exposures(tmp_path, "other") is None
+    wrong_gain = FOUND.as_dict() | {"cameras": [{"camera": "a", "gains": [0.0, 1.0, 1.0]}]}
+    for content in ("[]", '{"cameras": 3}', '{"cameras": []}', json.dumps(wrong_gain)):
+        path.write_text(content)
+        with pytest.raises(AssetFormatError, match="exposures of cameras must be as beam reconstruct wrote them"):
+            read_exposures(tmp_path)
