@@ -48,7 +48,11 @@ class Planes:
     costs: NDArray[np.float32]
 
 
-def find_planes(views: Sequence[CapturedView], *, device=None, side=SIDE, rounds=ROUNDS, seed=0) -> list[Planes]:
+AGREEMENTS = 2
+"""Times that views look at each other's depths, after the finest level."""
+
+
+def find_planes(views: Sequence[CapturedView], *, device=None, side=SIDE, rounds=ROUNDS, agreements=AGREEMENTS, seed=0) -> list[Planes]:
     target = resolve_device(device)
     focus = viewing_focus(views)[0]
     away = np.array([view.camera.position - focus for view in views])
@@ -60,12 +64,17 @@ def find_planes(views: Sequence[CapturedView], *, device=None, side=SIDE, rounds
         order = np.argsort(row, kind="stable")[1:]
         near.append([int(i) for i in order[row[order] <= WIDEST][:MOST_NEIGHBORS]])
     factor = max(1, round(max(max(v.camera.width, v.camera.height) for v in views) / side))
-    found = [None] * len(views)
-    for level in range(LEVELS - 1, -1, -1):
-        small = [view.reduced(factor * 2**level) for view in views]
-        levels = np.concatenate([linear_to_srgb(v.color) @ LUMINANCE.astype(np.float32) for v in small], axis=None)
-        firsts = np.cumsum([0] + [v.camera.width * v.camera.height for v in small])
-        array = upload(levels, float, target)
+    found = [(wp.empty(0, dtype=wp.vec4, device=target), 0, None)] * len(views)
+    none = wp.empty(0, dtype=float, device=target)
+    stages = [(level, False) for level in range(LEVELS - 1, -1, -1)] + [(0, True)] * agreements
+    for stage, (level, agree) in enumerate(stages):
+        if not agree:
+            small = [view.reduced(factor * 2**level) for view in views]
+            levels = np.concatenate([linear_to_srgb(v.color) @ LUMINANCE.astype(np.float32) for v in small], axis=None)
+            array = upload(levels, float, target)
+            firsts = np.cumsum([0] + [v.camera.width * v.camera.height for v in small])
+        depths = upload(np.concatenate([f[0].numpy()[:, 3] for f in found]), float, target) if agree else none
+        new = []
         for i, view in enumerate(small):
             sv = StereoView()
             cam = view.camera
@@ -83,14 +92,15 @@ def find_planes(views: Sequence[CapturedView], *, device=None, side=SIDE, rounds
             nbs = wp.array(others, dtype=StereoNeighbor, device=target)
             pixels = cam.width * cam.height
             planes, costs = wp.empty(pixels, dtype=wp.vec4, device=target), wp.empty(pixels, dtype=float, device=target)
-            coarse, width = (wp.empty(0, dtype=wp.vec4, device=target), 0) if found[i] is None else found[i][:2]
-            launch_begin_planes(array, sv, nbs, coarse, width, seed + 1000 * level + i, planes, costs, target)
-            for r in range(rounds):
-                spread = 0.5 ** (r + (LEVELS - 1 - level))
-                launch_improve_planes(array, sv, nbs, spread, seed + 7919 * (r + 1) + 31 * level + i, planes, costs, target)
-            found[i] = (planes, cam.width, costs, cam)
+            launch_begin_planes(array, depths, sv, nbs, *found[i][:2], seed + 1000 * stage + i, planes, costs, target)
+            for r in range(rounds // (2 if agree else 1)):
+                spread = 0.5 ** (r + stage)
+                launch_improve_planes(array, depths, sv, nbs, spread, seed + 7919 * (r + 1) + 31 * stage + i, planes, costs, target)
+            new.append((planes, cam.width, costs))
+        found = new
     result = []
-    for planes, width, costs, cam in found:
+    for (planes, width, costs), view in zip(found, small):
+        cam = view.camera
         p = planes.numpy().reshape(cam.height, cam.width, 4)
         result.append(Planes(cam, p[..., 3], p[..., :3] @ cam.camera_to_world[:3, :3].T.astype(np.float32), costs.numpy().reshape(cam.height, cam.width)))
     return result

@@ -39,6 +39,10 @@ NEITHER = wp.constant(1.0)
 
 WORST = wp.constant(2.0)
 
+FARTHEST = wp.constant(3.0)
+PER_PIXEL = wp.constant(0.15)
+"""Most pixels by which a point that two views show may miss itself, to count; the cost of one."""
+
 
 @wp.struct
 class StereoView:
@@ -135,8 +139,30 @@ def unlikeness(
 
 
 @wp.func
+def miss(
+    depths: wp.array[float], view: StereoView, other: StereoNeighbor, column: int, row: int, plane: wp.vec4
+) -> float:
+    """Distance [pixel] at which the point that another view shows where this pixel's is lies in this view."""
+    p = other.turn * (ray_through(view, float(column), float(row)) * plane[3]) + other.shift
+    if not (p[2] > 0.0):
+        return FARTHEST
+    u = other.focal[0] * p[0] / p[2] + other.center[0]
+    v = other.focal[1] * p[1] / p[2] + other.center[1]
+    if not (u >= 0.0 and v >= 0.0 and u < float(other.width) and v < float(other.height)):
+        return FARTHEST
+    depth = depths[other.first_pixel + int(v) * other.width + int(u)]
+    q = wp.transpose(other.turn) * (p * (depth / p[2]) - other.shift)
+    if not (q[2] > 0.0):
+        return FARTHEST
+    x = view.focal[0] * q[0] / q[2] + view.center[0] - 0.5 - float(column)
+    y = view.focal[1] * q[1] / q[2] + view.center[1] - 0.5 - float(row)
+    return wp.min(wp.sqrt(x * x + y * y), FARTHEST)
+
+
+@wp.func
 def cost_of(
     levels: wp.array[float],
+    depths: wp.array[float],
     view: StereoView,
     others: wp.array[StereoNeighbor],
     column: int,
@@ -153,6 +179,8 @@ def cost_of(
     second = float(WORST)
     for i in range(others.shape[0]):
         cost = unlikeness(levels, view, others[i], column, row, plane)
+        if depths.shape[0] > 0:
+            cost += PER_PIXEL * miss(depths, view, others[i], column, row, plane)
         if cost < best:
             second = best
             best = cost
@@ -179,6 +207,7 @@ def as_plane(normal: wp.vec3, depth: float) -> wp.vec4:
 def begin_planes_kernel(
     first: int,
     levels: wp.array[float],
+    depths: wp.array[float],
     view: StereoView,
     others: wp.array[StereoNeighbor],
     coarse: wp.array[wp.vec4],
@@ -194,17 +223,20 @@ def begin_planes_kernel(
     stream = hash_combine(seed, wp.uint32(pixel))
     part = unit_float(hash_combine(stream, wp.uint32(1)))
     plane = as_plane(random_normal(stream), 1.0 / (view.farthest + part * (view.nearest - view.farthest)))
-    if coarse_width > 0:
+    if coarse_width == view.width:
+        plane = coarse[pixel]
+    elif coarse_width > 0:
         height = coarse.shape[0] / coarse_width
         plane = coarse[wp.min(row / 2, height - 1) * coarse_width + wp.min(column / 2, coarse_width - 1)]
     out_planes[pixel] = plane
-    out_costs[pixel] = cost_of(levels, view, others, column, row, plane)
+    out_costs[pixel] = cost_of(levels, depths, view, others, column, row, plane)
 
 
 @wp.kernel
 def improve_planes_kernel(
     first: int,
     levels: wp.array[float],
+    depths: wp.array[float],
     view: StereoView,
     others: wp.array[StereoNeighbor],
     color: int,
@@ -235,7 +267,7 @@ def improve_planes_kernel(
             normal = wp.vec3(near[0], near[1], near[2])
             depth = near[3] * wp.dot(normal, ray_through(view, float(x), float(y))) / wp.dot(normal, middle)
             trial = as_plane(normal, depth)
-            found = cost_of(levels, view, others, column, row, trial)
+            found = cost_of(levels, depths, view, others, column, row, trial)
             if found < cost:
                 plane = trial
                 cost = found
@@ -252,7 +284,7 @@ def improve_planes_kernel(
         else:
             normal = wp.normalize(normal + 0.3 * spread * (random_normal(stream) - wp.vec3(0.0, 0.0, -0.5)))
         trial = as_plane(normal, 1.0 / inverse)
-        found = cost_of(levels, view, others, column, row, trial)
+        found = cost_of(levels, depths, view, others, column, row, trial)
         if found < cost:
             plane = trial
             cost = found
@@ -260,15 +292,15 @@ def improve_planes_kernel(
     out_costs[pixel] = cost
 
 
-def launch_begin_planes(levels, view, others, coarse, coarse_width, seed, planes, costs, device) -> None:
+def launch_begin_planes(levels, depths, view, others, coarse, coarse_width, seed, planes, costs, device) -> None:
     """Write the planes that a view's search begins with, and their costs; of a coarser level if its width is not 0."""
-    inputs = [levels, view, others, coarse, coarse_width, wp.uint32(seed)]
+    inputs = [levels, depths, view, others, coarse, coarse_width, wp.uint32(seed)]
     launch(begin_planes_kernel, len(planes), inputs=inputs, outputs=[planes, costs], device=device, min_chunk=256)
 
 
-def launch_improve_planes(levels, view, others, spread, seed, planes, costs, device) -> None:
+def launch_improve_planes(levels, depths, view, others, spread, seed, planes, costs, device) -> None:
     """Improve all planes of a view once, one colour of the chessboard after the other."""
     for color in range(2):
-        inputs = [levels, view, others, color, spread, wp.uint32(seed)]
+        inputs = [levels, depths, view, others, color, spread, wp.uint32(seed)]
         count = view.height * ((view.width + 1) // 2)
         launch(improve_planes_kernel, count, inputs=inputs, outputs=[planes, costs], device=device, min_chunk=256)
