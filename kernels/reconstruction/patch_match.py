@@ -22,7 +22,11 @@ wp.set_module_options({"enable_backward": False})
 
 REACH = wp.constant(5)
 STEP = wp.constant(2)
-"""Half the side of a patch, and the distance of its samples [pixel]: 6 x 6 samples."""
+SIDE = wp.constant(6)
+SAMPLES = wp.constant(36)
+"""Half the side of a patch, and the distance of its samples [pixel]; samples along a side, and in all."""
+
+Samples = wp.types.vector(length=36, dtype=float)
 
 SPREAD = wp.constant(4.0)
 CONTRAST = wp.constant(0.12)
@@ -76,14 +80,38 @@ def ray_through(view: StereoView, x: float, y: float) -> wp.vec3:
     return wp.vec3((x + 0.5 - view.center[0]) / view.focal[0], (y + 0.5 - view.center[1]) / view.focal[1], 1.0)
 
 
+@wp.struct
+class Patch:
+    """The samples around a pixel: brightness against the middle's, and weights; 0 outside the image."""
+
+    values: Samples
+    weights: Samples
+
+
+@wp.func
+def patch_around(levels: wp.array[float], view: StereoView, column: int, row: int) -> Patch:
+    patch = Patch()
+    own = levels[view.first_pixel + row * view.width + column]
+    for k in range(SAMPLES):
+        i = STEP * (k % SIDE) - REACH
+        j = STEP * (k / SIDE) - REACH
+        x = column + i
+        y = row + j
+        if x >= 0 and y >= 0 and x < view.width and y < view.height:
+            value = levels[view.first_pixel + y * view.width + x] - own
+            patch.values[k] = value
+            patch.weights[k] = wp.exp(-wp.abs(value) / CONTRAST - wp.sqrt(float(i * i + j * j)) / SPREAD)
+    return patch
+
+
 @wp.func
 def brightness(levels: wp.array[float], view: StereoNeighbor, x: float, y: float) -> float:
     """Bilinear brightness at a place at least half a pixel inside the image."""
-    left = wp.floor(x - 0.5)
-    top = wp.floor(y - 0.5)
-    u = x - 0.5 - left
-    v = y - 0.5 - top
-    at = view.first_pixel + int(top) * view.width + int(left)
+    left = wp.min(int(x - 0.5), view.width - 2)
+    top = wp.min(int(y - 0.5), view.height - 2)
+    u = x - 0.5 - float(left)
+    v = y - 0.5 - float(top)
+    at = view.first_pixel + top * view.width + left
     upper = levels[at] * (1.0 - u) + levels[at + 1] * u
     lower = levels[at + view.width] * (1.0 - u) + levels[at + view.width + 1] * u
     return upper * (1.0 - v) + lower * v
@@ -91,39 +119,35 @@ def brightness(levels: wp.array[float], view: StereoNeighbor, x: float, y: float
 
 @wp.func
 def unlikeness(
-    levels: wp.array[float], view: StereoView, other: StereoNeighbor, column: int, row: int, plane: wp.vec4
+    levels: wp.array[float], view: StereoView, other: StereoNeighbor, patch: Patch, middle: wp.vec3, plane: wp.vec4
 ) -> float:
-    """Cost of a pixel's plane in one other view."""
+    """Cost of the plane of the pixel with the ray ``middle`` in one other view."""
     normal = wp.vec3(plane[0], plane[1], plane[2])
-    middle = ray_through(view, float(column), float(row))
-    distance = plane[3] * wp.dot(normal, middle)
     seen = other.turn * (middle * plane[3]) + other.shift
     if not (wp.dot(other.turn * normal, wp.normalize(seen)) < -LEAST_FACING):
         return WORST
-    own = levels[view.first_pixel + row * view.width + column]
+    # The plane's points on rays are projected by a homography; rays of a patch are evenly spaced.
+    maps = other.turn + wp.outer(other.shift, normal) / (plane[3] * wp.dot(normal, middle))
+    start = maps * middle
+    right = maps * wp.vec3(1.0 / view.focal[0], 0.0, 0.0)
+    down = maps * wp.vec3(0.0, 1.0 / view.focal[1], 0.0)
     total = float(0.0)
     sum_a = float(0.0)
     sum_b = float(0.0)
     sum_aa = float(0.0)
     sum_bb = float(0.0)
     sum_ab = float(0.0)
-    for j in range(-REACH, REACH + 1, STEP):
-        for i in range(-REACH, REACH + 1, STEP):
-            x = wp.clamp(column + i, 0, view.width - 1)
-            y = wp.clamp(row + j, 0, view.height - 1)
-            ray = ray_through(view, float(x), float(y))
-            depth = distance / wp.dot(normal, ray)
-            p = other.turn * (ray * depth) + other.shift
-            if not (depth > 0.0 and p[2] > 0.0):
-                return WORST
+    for k in range(SAMPLES):
+        weight = patch.weights[k]
+        if weight > 0.0:
+            p = start + float(STEP * (k % SIDE) - REACH) * right + float(STEP * (k / SIDE) - REACH) * down
             u = other.focal[0] * p[0] / p[2] + other.center[0]
             v = other.focal[1] * p[1] / p[2] + other.center[1]
-            if not (u > 0.5 and v > 0.5 and u < float(other.width) - 0.5 and v < float(other.height) - 0.5):
+            inside = u >= 0.5 and v >= 0.5 and u <= float(other.width) - 0.5 and v <= float(other.height) - 0.5
+            if not (p[2] > 0.0 and inside):
                 return WORST
-            a = levels[view.first_pixel + y * view.width + x] - own
-            b = brightness(levels, other, wp.min(u, float(other.width) - 0.501), wp.min(v, float(other.height) - 0.501))
-            b -= own
-            weight = wp.exp(-wp.abs(a) / CONTRAST - wp.sqrt(float(i * i + j * j)) / SPREAD)
+            a = patch.values[k]
+            b = brightness(levels, other, u, v)
             total += weight
             sum_a += weight * a
             sum_b += weight * b
@@ -134,8 +158,7 @@ def unlikeness(
     bb = sum_bb / total - (sum_b / total) * (sum_b / total)
     if not (aa > LEAST_VARIANCE and bb > LEAST_VARIANCE):
         return NEITHER
-    ab = sum_ab / total - (sum_a / total) * (sum_b / total)
-    return 1.0 - ab / wp.sqrt(aa * bb)
+    return 1.0 - (sum_ab / total - (sum_a / total) * (sum_b / total)) / wp.sqrt(aa * bb)
 
 
 @wp.func
@@ -165,11 +188,12 @@ def cost_of(
     depths: wp.array[float],
     view: StereoView,
     others: wp.array[StereoNeighbor],
+    patch: Patch,
     column: int,
     row: int,
     plane: wp.vec4,
 ) -> float:
-    """Mean cost of a pixel's plane in the two views that show it best: it is hidden in others."""
+    """Mean cost of a pixel's plane in the two views that show it best: it may be hidden in others."""
     middle = ray_through(view, float(column), float(row))
     facing = -wp.dot(wp.vec3(plane[0], plane[1], plane[2]), middle) / wp.length(middle)
     inverse = 1.0 / plane[3]
@@ -178,7 +202,7 @@ def cost_of(
     best = float(WORST)
     second = float(WORST)
     for i in range(others.shape[0]):
-        cost = unlikeness(levels, view, others[i], column, row, plane)
+        cost = unlikeness(levels, view, others[i], patch, middle, plane)
         if depths.shape[0] > 0:
             cost += PER_PIXEL * miss(depths, view, others[i], column, row, plane)
         if cost < best:
@@ -186,6 +210,8 @@ def cost_of(
             best = cost
         elif cost < second:
             second = cost
+    if others.shape[0] == 1:
+        return best
     return 0.5 * (best + second)
 
 
@@ -228,8 +254,9 @@ def begin_planes_kernel(
     elif coarse_width > 0:
         height = coarse.shape[0] / coarse_width
         plane = coarse[wp.min(row / 2, height - 1) * coarse_width + wp.min(column / 2, coarse_width - 1)]
+    patch = patch_around(levels, view, column, row)
     out_planes[pixel] = plane
-    out_costs[pixel] = cost_of(levels, depths, view, others, column, row, plane)
+    out_costs[pixel] = cost_of(levels, depths, view, others, patch, column, row, plane)
 
 
 @wp.kernel
@@ -254,6 +281,7 @@ def improve_planes_kernel(
         return
     pixel = row * view.width + column
     middle = ray_through(view, float(column), float(row))
+    patch = patch_around(levels, view, column, row)
     plane = out_planes[pixel]
     cost = out_costs[pixel]
     for k in range(8):
@@ -267,7 +295,7 @@ def improve_planes_kernel(
             normal = wp.vec3(near[0], near[1], near[2])
             depth = near[3] * wp.dot(normal, ray_through(view, float(x), float(y))) / wp.dot(normal, middle)
             trial = as_plane(normal, depth)
-            found = cost_of(levels, depths, view, others, column, row, trial)
+            found = cost_of(levels, depths, view, others, patch, column, row, trial)
             if found < cost:
                 plane = trial
                 cost = found
@@ -284,7 +312,7 @@ def improve_planes_kernel(
         else:
             normal = wp.normalize(normal + 0.3 * spread * (random_normal(stream) - wp.vec3(0.0, 0.0, -0.5)))
         trial = as_plane(normal, 1.0 / inverse)
-        found = cost_of(levels, depths, view, others, column, row, trial)
+        found = cost_of(levels, depths, view, others, patch, column, row, trial)
         if found < cost:
             plane = trial
             cost = found

@@ -1,0 +1,190 @@
+"""The Gaussians that a fit begins with where nothing tells the subject from its surroundings.
+
+Discs lie on the surface that photographs agree on. What they do not agree on still has to be somewhere, or the fit
+would paint it onto the surface: each view's other pixels take depths that join those of the surface around them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.linalg import spsolve
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.checks import require_count
+from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
+from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.records import GaussianArrays
+from beam_warp.reconstruction.hull import viewing_focus
+from beam_warp.reconstruction.initial import (
+    DISC_OPACITY,
+    HIDING_OPACITY,
+    even_surface_points,
+    seen_colors,
+    surface_discs,
+)
+from beam_warp.reconstruction.stereo import DEPTHS, agreed_surface, find_planes, reduction
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import SH_C0
+
+FILLED_PIXELS = 30_000
+"""Pixels to which a view is reduced, about, to join depths."""
+
+FILLED_SHARE = 0.5
+"""Most of the Gaussians that are not on the surface."""
+
+FILLED_OPACITY = 0.3
+"""Opacity of discs that are not on the surface: some are wrong, and are easily pruned when they start faint."""
+
+EDGE = 0.04
+LEAST_TIE = 1e-3
+"""Difference of display colours at which neighbouring pixels are tied by 1/e, and how strongly all are at least: depth
+jumps where colours do."""
+
+SEEN_THROUGH = 0.05
+"""A disc is left out if another view shows the surface behind it, by more than this part of the depth."""
+
+LEAST_FACING = 0.05
+"""Cosine between the surface's normal and the way to the camera above which a view shows its outside."""
+
+
+def unmasked_gaussians(
+    views: Sequence[CapturedView], count: int, *, device: str | None = None, seed: int = 0
+) -> GaussianCloud | None:
+    """Return discs on the surface that photographs agree on, and, fainter, where each one's other pixels may be.
+
+    Args:
+        views: Photographs of one moment, at least two. Coverage is not looked at.
+        count: Number of Gaussians.
+        device: Warp device; the first GPU without, or the CPU where there is none.
+        seed: Same seed, same device, same result.
+
+    Returns:
+        ``count`` Gaussians with radiance of degree 0 in scene-linear Rec.709, normals, and ids from 0 on: first those
+        on the surface, then the others. None if no two views agree on anything.
+
+    Raises:
+        InvalidArrayError: There are fewer than two views.
+        InvalidOptionError: ``count`` or ``seed`` is out of range.
+        DeviceError: The device is not there.
+    """
+    require_count("count", count, 1, 2**26)
+    mesh = agreed_surface(find_planes(views, count, device=device, seed=seed), device=device)
+    if mesh is None:
+        return None
+
+    surface = surface_discs(*even_surface_points(mesh, count, device=device, seed=seed))
+    others = _elsewhere(views, surface, int(FILLED_SHARE * count), device, seed)
+    positions, normals, spacing = even_surface_points(mesh, count - len(others), device=device, seed=seed)
+    colors = seen_colors(views, surface_discs(positions, normals, spacing), device=device)
+    known = np.column_stack([positions, normals, np.full(len(positions), spacing), colors])
+    table = np.concatenate([known, others]).astype(np.float32)
+    opacities = np.where(np.arange(count) < len(known), DISC_OPACITY, FILLED_OPACITY)
+    return surface_discs(table[:, :3], table[:, 3:6], table[:, 6]).with_arrays(
+        opacities=opacities.astype(np.float32),
+        radiance=((table[:, None, 7:] - 0.5) / SH_C0).astype(np.float32),
+        radiance_color_space=LINEAR_REC709,
+    )
+
+
+def joined_depth(depth: NDArray[np.floating], colors: NDArray[np.floating], farthest: float) -> NDArray[np.float64]:
+    """Return an image of depth in which pixels without any take it from those around them.
+
+    Inverse depth becomes harmonic: each pixel's is the mean of its neighbours', those of similar colour counting more.
+    Inverse depths of a plane are linear in the image, so that a plane is continued as a plane.
+
+    Args:
+        depth: Known depths [m], 0 where there is none, ``(H, W)``; at least one is known.
+        colors: Display colours, ``(H, W, 3)``.
+        farthest: Largest depth that is given to a pixel [m].
+
+    Returns:
+        Depths [m], ``(H, W)``; those known stay.
+
+    Source: Pérez et al. 2003 for the harmonic interpolation.
+    """
+    known = (depth > 0.0).ravel()
+    inverse = np.zeros(depth.size)
+    inverse[known] = 1.0 / depth.ravel()[known]
+    if not known.all():
+        ties = _ties(colors)
+        system = (diags(np.asarray(ties.sum(axis=1)).ravel()) - ties).tocsr()[~known]
+        inverse[~known] = spsolve(system[:, ~known].tocsc(), -system[:, known] @ inverse[known])
+    return 1.0 / np.maximum(inverse, 1.0 / farthest).reshape(depth.shape)
+
+
+def _ties(colors: NDArray[np.floating]) -> csr_matrix:
+    """Return how strongly neighbouring pixels are tied, symmetric, ``(P, P)``."""
+    number = np.arange(colors.shape[0] * colors.shape[1]).reshape(colors.shape[:2])
+    pairs = [(np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])]
+    weights = [np.exp(-np.abs(colors[a] - colors[b]).max(axis=-1) / EDGE).ravel() + LEAST_TIE for a, b in pairs]
+    ends = [np.concatenate([number[pair[k]].ravel() for pair in pairs]) for k in (0, 1)]
+    half = csr_matrix((np.concatenate(weights), tuple(ends)), shape=(number.size, number.size))
+    return half + half.T
+
+
+def _elsewhere(
+    views: Sequence[CapturedView], surface: GaussianCloud, most: int, device: str | None, seed: int
+) -> NDArray[np.float64]:
+    """Return what views show beside the surface, ``(N, 10)``: positions, normals to the camera, spacings, colours."""
+    small = [view.reduced(reduction(view, FILLED_PIXELS)) for view in views]
+    cameras = [view.camera for view in small]
+    depths = [_surface_depth(surface, camera, resolve_device(device)) for camera in cameras]
+    focus = viewing_focus(views)[0]
+    rows = []
+    for index, (view, camera) in enumerate(zip(small, cameras, strict=True)):
+        if not (depths[index] > 0.0).any():
+            continue
+        farthest = DEPTHS[1] * float(np.linalg.norm(camera.position - focus))
+        joined = joined_depth(depths[index], linear_to_srgb(view.color), farthest)
+        is_new = depths[index] <= 0.0
+        rays = camera.directions()[is_new]
+        places = camera.position + rays * (joined[is_new] / (rays @ camera.forward))[:, None]
+        kept = ~_seen_through(places, [(cameras[j], depths[j]) for j in range(len(small)) if j != index])
+        spacing = joined[is_new] / camera.focal_x
+        rows.append(np.column_stack([places, -rays, spacing, view.color[is_new]])[kept])
+    table = np.concatenate([np.zeros((0, 10)), *rows])
+    picked = table[np.sort(np.random.default_rng(seed).permutation(len(table))[:most])]
+    picked[:, 6] *= np.sqrt(len(table) / max(len(picked), 1))
+    return picked
+
+
+def _surface_depth(surface: GaussianCloud, camera: Camera, device: Any) -> NDArray[np.float32]:
+    """Return the depth of the outside of the surface [m], 0 where a view sees none of it, ``(H, W)``."""
+    assert surface.normals is not None
+    towards = camera.position - surface.positions
+    facing = (towards * surface.normals).sum(axis=1) > LEAST_FACING * np.linalg.norm(towards, axis=1)
+    shown = surface.select(np.flatnonzero(facing))
+    size = (camera.height, camera.width)
+    if not len(shown):
+        return np.zeros(size, np.float32)
+    gaussians = GaussianArrays(
+        upload(shown.positions, wp.vec3, device),
+        upload(shown.orientations, wp.quat, device),
+        upload(shown.scales, wp.vec3, device),
+        wp.full(len(shown), HIDING_OPACITY, dtype=float, device=device),
+    )
+    images = Rasterizer(len(shown), [camera], device=device).draw(gaussians)
+    depth = images.median_depth.numpy().reshape(size)
+    return np.where(images.alpha.numpy().reshape(size) > 0.5, depth, np.float32(0.0))
+
+
+def _seen_through(
+    places: NDArray[np.float64], others: Sequence[tuple[Camera, NDArray[np.floating]]]
+) -> NDArray[np.bool_]:
+    """Tell which places other views see the surface behind, ``(N,)``."""
+    result = np.zeros(len(places), bool)
+    for camera, depth in others:
+        x, y, z = camera.project(places).T
+        inside = (x >= 0.0) & (y >= 0.0) & (x < camera.width) & (y < camera.height)
+        behind = np.zeros(len(places))
+        behind[inside] = depth[y[inside].astype(int), x[inside].astype(int)]
+        result |= z < (1.0 - SEEN_THROUGH) * behind
+    return result
