@@ -23,6 +23,7 @@ from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.reconstruction.rig import refine_rig
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
+from beam_warp.reconstruction.unmasked import seen_in_common, unmasked_gaussians
 from beam_warp.world.gaussians import GaussianCloud
 
 MOST_UNPAIRED = 0.5
@@ -75,7 +76,7 @@ class FitAndTrack:
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
         """Fit a key frame from its images alone, their exposures matched."""
         start, findings, said = self._start(views), [], {}
-        if all(view.alpha is not None for view in views):  # else it is no surface, and does not say who sees what
+        if _is_masked(views):  # else it is no surface, and does not say who sees what
             up = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])  # outward, of discs on a hull
             gains = view_gains(start, outward_normals(start, up), views, device=self.device)
             findings = judge_gains(gains, views)
@@ -91,7 +92,11 @@ class FitAndTrack:
                 )
                 findings.append(Finding("warning", "few-cameras", what, remedy="Add cameras."))
         fit = fit_gaussians(views, start, self.fitting, device=self.device, progress=progress)
-        track = begin_track(fit.cloud, views, self._tracking, device=self.device)
+        cloud = fit.cloud
+        if not _is_masked(views):
+            inner = np.flatnonzero(seen_in_common(views, cloud.positions))
+            cloud = cloud.select(inner) if len(inner) else cloud
+        track = begin_track(cloud, views, self._tracking, device=self.device)
         return track, {**fit.report, **said, "findings": [vars(finding) for finding in findings]}
 
     def advance(
@@ -129,20 +134,29 @@ class FitAndTrack:
         return following, {**report, **said}
 
     def _start(self, views: Sequence[CapturedView]) -> GaussianCloud:
-        """Return the Gaussians that a fit begins with."""
-        known = None if all(view.alpha is not None for view in views) else self.points  # a visual hull says more
+        """Return the Gaussians that a fit begins with: of a visual hull, known points, or what photographs agree on."""
+        count, seed = self.fitting.gaussian_count, self.fitting.seed
+        known = None if _is_masked(views) else self.points  # a visual hull says more
+        if known is None and not _is_masked(views) and len(views) > 1:
+            start = unmasked_gaussians(views, count, device=self.device, seed=seed)
+            if start is not None:
+                return start
         return initial_gaussians(
             views,
-            self.fitting.gaussian_count,
+            count,
             points=None if known is None else known.positions,
             point_colors=None if known is None else known.colors,
             device=self.device,
-            seed=self.fitting.seed,
+            seed=seed,
         )
 
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""
         return Track.from_arrays(arrays)
+
+
+def _is_masked(views: Sequence[CapturedView]) -> bool:
+    return all(view.alpha is not None for view in views)
 
 
 def _exposures(gains: ViewGains) -> dict[str, float]:

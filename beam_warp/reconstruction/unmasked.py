@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from beam_warp.capture.rigs import LEAST_SHARE, seen_by
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_count
 from beam_warp.device.arrays import resolve_device, upload
@@ -34,14 +35,14 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 
-FILLED_PIXELS = 30_000
+PIXELS = 30_000
 """Pixels to which a view is reduced, about, to join depths."""
 
-FILLED_SHARE = 0.5
-"""Most of the Gaussians that are not on the surface."""
+ELSEWHERE_SHARE = 0.5
+"""Most of the Gaussians that are not on the surface that views see in common."""
 
-FILLED_OPACITY = 0.3
-"""Opacity of discs that are not on the surface: some are wrong, and are easily pruned when they start faint."""
+ELSEWHERE_OPACITY = 0.3
+"""Opacity of discs whose depth no view knows: some are wrong, and are easily pruned when they start faint."""
 
 EDGE = 0.04
 LEAST_TIE = 1e-3
@@ -79,19 +80,28 @@ def unmasked_gaussians(
     mesh = agreed_surface(find_planes(views, count, device=device, seed=seed), device=device)
     if mesh is None:
         return None
-
-    surface = surface_discs(*even_surface_points(mesh, count, device=device, seed=seed))
-    others = _elsewhere(views, surface, int(FILLED_SHARE * count), device, seed)
+    everything = surface_discs(*even_surface_points(mesh, count, device=device, seed=seed))
+    mesh.update_faces(seen_in_common(views, mesh.triangles_center))
+    if mesh.is_empty:
+        return None
+    others = _elsewhere(views, everything, int(ELSEWHERE_SHARE * count), device, seed)
     positions, normals, spacing = even_surface_points(mesh, count - len(others), device=device, seed=seed)
     colors = seen_colors(views, surface_discs(positions, normals, spacing), device=device)
-    known = np.column_stack([positions, normals, np.full(len(positions), spacing), colors])
+    known = np.column_stack(
+        [positions, normals, np.full(len(positions), spacing), np.full(len(positions), DISC_OPACITY), colors]
+    )
     table = np.concatenate([known, others]).astype(np.float32)
-    opacities = np.where(np.arange(count) < len(known), DISC_OPACITY, FILLED_OPACITY)
     return surface_discs(table[:, :3], table[:, 3:6], table[:, 6]).with_arrays(
-        opacities=opacities.astype(np.float32),
-        radiance=((table[:, None, 7:] - 0.5) / SH_C0).astype(np.float32),
+        opacities=table[:, 7],
+        radiance=(table[:, None, 8:] - np.float32(0.5)) / np.float32(SH_C0),
         radiance_color_space=LINEAR_REC709,
     )
+
+
+def seen_in_common(views: Sequence[CapturedView], points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Tell which points lie in as many images as a subject does, ``(N,)``: the others are backdrops of a few views."""
+    counts = np.sum([seen_by(view.camera, points.astype(np.float64)) for view in views], axis=0)
+    return counts >= max(2, LEAST_SHARE * len(views))
 
 
 def joined_depth(depth: NDArray[np.floating], colors: NDArray[np.floating], farthest: float) -> NDArray[np.float64]:
@@ -133,24 +143,29 @@ def _ties(colors: NDArray[np.floating]) -> csr_matrix:
 def _elsewhere(
     views: Sequence[CapturedView], surface: GaussianCloud, most: int, device: str | None, seed: int
 ) -> NDArray[np.float64]:
-    """Return what views show beside the surface, ``(N, 10)``: positions, normals to the camera, spacings, colours."""
-    small = [view.reduced(reduction(view, FILLED_PIXELS)) for view in views]
-    cameras = [view.camera for view in small]
-    depths = [_surface_depth(surface, camera, resolve_device(device)) for camera in cameras]
+    """Return discs of what views show beside the surface in common.
+
+    Each is a position, a normal to the camera, spacing, opacity and colour, ``(N, 11)`` with N at most ``most``.
+    """
+    small = [view.reduced(reduction(view, PIXELS)) for view in views]
+    depths = [_surface_depth(surface, view.camera, resolve_device(device)) for view in small]
     focus = viewing_focus(views)[0]
     rows = []
-    for index, (view, camera) in enumerate(zip(small, cameras, strict=True)):
-        if not (depths[index] > 0.0).any():
+    for index, view in enumerate(small):
+        camera, known = view.camera, depths[index] > 0.0
+        if not known.any():
             continue
         farthest = DEPTHS[1] * float(np.linalg.norm(camera.position - focus))
-        joined = joined_depth(depths[index], linear_to_srgb(view.color), farthest)
-        is_new = depths[index] <= 0.0
-        rays = camera.directions()[is_new]
-        places = camera.position + rays * (joined[is_new] / (rays @ camera.forward))[:, None]
-        kept = ~_seen_through(places, [(cameras[j], depths[j]) for j in range(len(small)) if j != index])
-        spacing = joined[is_new] / camera.focal_x
-        rows.append(np.column_stack([places, -rays, spacing, view.color[is_new]])[kept])
-    table = np.concatenate([np.zeros((0, 10)), *rows])
+        depth = joined_depth(depths[index], linear_to_srgb(view.color), farthest)[..., None]
+        rays = camera.directions()
+        places = camera.position + rays * depth / (rays @ camera.forward)[..., None]
+        opacity = np.where(known, DISC_OPACITY, ELSEWHERE_OPACITY)[..., None]
+        table = np.concatenate([places, -rays, depth / camera.focal_x, opacity, view.color], axis=-1).reshape(-1, 11)
+        others = [(other.camera, seen) for other, seen in zip(small, depths, strict=True) if other is not view]
+        known = known.ravel()
+        shown = known & seen_in_common(views, table[:, :3])
+        rows.append(table[~shown & (known | ~_seen_through(table[:, :3], others))])
+    table = np.concatenate([np.zeros((0, 11)), *rows])
     picked = table[np.sort(np.random.default_rng(seed).permutation(len(table))[:most])]
     picked[:, 6] *= np.sqrt(len(table) / max(len(picked), 1))
     return picked
