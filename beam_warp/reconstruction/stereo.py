@@ -2,7 +2,7 @@
 
 Nothing is known but cameras and images. Every pixel of every view finds the plane whose patch looks most alike in the
 views beside it (`kernels.reconstruction.patch_match`), from coarse images to fine ones. Then all views search again,
-and a point that another view shows elsewhere costs too. What at least one other view confirms is fused.
+and a point that another view shows elsewhere costs too. Planes that go on from pixel to pixel are fused.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import numpy as np
 import trimesh
 import warp as wp
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_count
@@ -54,8 +56,15 @@ WIDEST = 75.0
 DEPTHS = (0.2, 4.0)
 """Least and largest depth that is looked for, in distances of the camera from the point that all look at."""
 
-LARGEST_COST = 0.6
-"""Cost up to which a plane counts: correlations of 0.55 and a miss of a pixel, say."""
+LARGEST_COST = 1.0
+"""Cost up to which a plane counts: more than chance has in common."""
+
+LARGEST_STEP = 2.0
+"""Distance [pixel] up to which a neighbour is on a pixel's plane."""
+
+LEAST_SHARE = 0.005
+LEAST_PIXELS = 121
+"""Least part of an image, and least number of pixels, that are a surface and not chance: those of a patch, at least."""
 
 SMALLEST_PART = 0.002
 """Parts of the surface with less area than this share of the largest one's are left out."""
@@ -100,7 +109,7 @@ def find_planes(
     if len(views) < 2:
         raise InvalidArrayError(f"views must be at least two, got {len(views)}. One view alone shows no depth.")
     target = resolve_device(device)
-    finest = [view.reduced(reduction(view, pixels)) for view in views]
+    finest = [view.reduced(reduction(view.camera, pixels)) for view in views]
     side = min(min(view.camera.width, view.camera.height) for view in finest)
     levels = int(np.clip(1 + np.log2(max(side / SMALLEST_SIDE, 1.0)), 1, LEVELS))
     search = _Search(views, target, seed)
@@ -111,30 +120,66 @@ def find_planes(
     return search.planes()
 
 
-def agreed_surface(planes: Sequence[ViewPlanes], *, device: str | None = None) -> trimesh.Trimesh | None:
-    """Fuse the planes that at least one other view confirms, and no more contradict; None if nothing is left."""
+@dataclass(frozen=True, eq=False)
+class AgreedSurface:
+    """What is known of the surface.
+
+    Attributes:
+        mesh: The planes of all views fused, open where nothing is known; its faces look outward.
+        depths: The depth of each view's own planes that are part of it [m], 0 elsewhere, ``(H, W)`` each.
+    """
+
+    mesh: trimesh.Trimesh
+    depths: tuple[NDArray[np.float32], ...]
+
+
+def agreed_surface(planes: Sequence[ViewPlanes], *, device: str | None = None) -> AgreedSurface | None:
+    """Fuse planes that go on from pixel to pixel and that other views do not contradict; None if nothing is left.
+
+    Chance finds planes too, but not the same surface over many pixels. So what two views show of a face at too wide an
+    angle to be sure of each pixel is still known where it is smooth.
+    """
     images = DepthImages.of(
         [
-            DepthView(
-                camera=found.camera,
-                depth=found.depth,
-                alpha=(found.costs < LARGEST_COST).astype(np.float32),
-                normals=found.normals,
-            )
+            DepthView(camera=found.camera, depth=found.depth, alpha=np.ones_like(found.depth), normals=found.normals)
             for found in planes
         ],
         device=device,
     )
-    images.keep(depth_consistency(images).mask())
+    large = np.concatenate([_in_large_parts(found) for found in planes], axis=None)
+    images.keep(upload(large, int, images.device))  # what is left out says nothing, not that nothing is there
+    images.keep(depth_consistency(images).mask(0))
+    kept = np.split(images.pixels.numpy()[:, 2] > 0.0, images.first_pixels[1:-1])
+    depths = [np.where(part.reshape(f.depth.shape), f.depth, 0.0) for f, part in zip(planes, kept, strict=True)]
     try:
-        return fuse_depths(images, smallest_part=SMALLEST_PART)
+        mesh = fuse_depths(images, smallest_part=SMALLEST_PART)
     except InvalidArrayError:
         return None
+    return AgreedSurface(mesh, tuple(depths))
 
 
-def reduction(view: CapturedView, pixels: int) -> int:
+def _in_large_parts(planes: ViewPlanes) -> NDArray[np.bool_]:
+    """Tell which pixels belong to a large surface, ``(H, W)``: one whose neighbours lie on each other's planes."""
+    camera, shape = planes.camera, planes.depth.shape
+    rays = camera.directions()
+    rays /= (rays @ camera.forward)[..., None]
+    distances = planes.depth * (planes.normals * rays).sum(axis=-1)
+    number = np.arange(planes.depth.size).reshape(shape)
+    pairs = []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        tied = (planes.costs[a] < LARGEST_COST) & (planes.costs[b] < LARGEST_COST)
+        for here, there in ((a, b), (b, a)):
+            expected = distances[here] / (planes.normals[here] * rays[there]).sum(axis=-1)
+            tied &= np.abs(expected / planes.depth[there] - 1.0) < LARGEST_STEP / camera.focal_x
+        pairs.append(np.stack([number[a][tied], number[b][tied]]))
+    ends = np.concatenate(pairs, axis=1)
+    graph = coo_matrix((np.ones(ends.shape[1]), tuple(ends)), shape=(number.size, number.size))
+    parts = connected_components(graph, directed=False)[1]
+    return (np.bincount(parts)[parts] >= max(LEAST_SHARE * number.size, LEAST_PIXELS)).reshape(shape)
+
+
+def reduction(camera: Camera, pixels: int) -> int:
     """Return the whole factor that leaves about as many pixels of a view."""
-    camera = view.camera
     factor = round((camera.width * camera.height / pixels) ** 0.5)
     return max(1, min(factor, min(camera.width, camera.height)))
 

@@ -7,10 +7,8 @@ would paint it onto the surface: each view's other pixels take depths that join 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
@@ -18,18 +16,9 @@ from scipy.sparse.linalg import spsolve
 from beam_warp.capture.rigs import LEAST_SHARE, seen_by
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_count
-from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
-from beam_warp.raster.rasterizer import Rasterizer
-from beam_warp.raster.records import GaussianArrays
 from beam_warp.reconstruction.hull import viewing_focus
-from beam_warp.reconstruction.initial import (
-    DISC_OPACITY,
-    HIDING_OPACITY,
-    even_surface_points,
-    seen_colors,
-    surface_discs,
-)
+from beam_warp.reconstruction.initial import DISC_OPACITY, even_surface_points, seen_colors, surface_discs
 from beam_warp.reconstruction.stereo import DEPTHS, agreed_surface, find_planes, reduction
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -51,9 +40,6 @@ jumps where colours do."""
 
 SEEN_THROUGH = 0.05
 """A disc is left out if another view shows the surface behind it, by more than this part of the depth."""
-
-LEAST_FACING = 0.05
-"""Cosine between the surface's normal and the way to the camera above which a view shows its outside."""
 
 
 def unmasked_gaussians(
@@ -77,14 +63,16 @@ def unmasked_gaussians(
         DeviceError: The device is not there.
     """
     require_count("count", count, 1, 2**26)
-    mesh = agreed_surface(find_planes(views, count, device=device, seed=seed), device=device)
-    if mesh is None:
+    planes = find_planes(views, count, device=device, seed=seed)
+    surface = agreed_surface(planes, device=device)
+    if surface is None:
         return None
-    everything = surface_discs(*even_surface_points(mesh, count, device=device, seed=seed))
+    mesh = surface.mesh
     mesh.update_faces(seen_in_common(views, mesh.triangles_center))
     if mesh.is_empty:
         return None
-    others = _elsewhere(views, everything, int(ELSEWHERE_SHARE * count), device, seed)
+    cameras = [found.camera for found in planes]
+    others = _elsewhere(views, cameras, surface.depths, int(ELSEWHERE_SHARE * count), seed)
     positions, normals, spacing = even_surface_points(mesh, count - len(others), device=device, seed=seed)
     colors = seen_colors(views, surface_discs(positions, normals, spacing), device=device)
     known = np.column_stack(
@@ -141,27 +129,34 @@ def _ties(colors: NDArray[np.floating]) -> csr_matrix:
 
 
 def _elsewhere(
-    views: Sequence[CapturedView], surface: GaussianCloud, most: int, device: str | None, seed: int
+    views: Sequence[CapturedView],
+    cameras: Sequence[Camera],
+    depths: Sequence[NDArray[np.floating]],
+    most: int,
+    seed: int,
 ) -> NDArray[np.float64]:
     """Return discs of what views show beside the surface in common.
 
     Each is a position, a normal to the camera, spacing, opacity and colour, ``(N, 11)`` with N at most ``most``.
     """
-    small = [view.reduced(reduction(view, PIXELS)) for view in views]
-    depths = [_surface_depth(surface, view.camera, resolve_device(device)) for view in small]
+    steps = [reduction(camera, PIXELS) for camera in cameras]
+    cameras = [camera.reduced(step) for camera, step in zip(cameras, steps, strict=True)]
+    depths = [depth[step // 2 :: step, step // 2 :: step] for depth, step in zip(depths, steps, strict=True)]
+    depths = [depth[: camera.height, : camera.width] for depth, camera in zip(depths, cameras, strict=True)]
     focus = viewing_focus(views)[0]
     rows = []
-    for index, view in enumerate(small):
-        camera, known = view.camera, depths[index] > 0.0
+    for index, camera in enumerate(cameras):
+        known = depths[index] > 0.0
         if not known.any():
             continue
+        color = views[index].reduced(views[index].camera.width // camera.width).color[: camera.height, : camera.width]
         farthest = DEPTHS[1] * float(np.linalg.norm(camera.position - focus))
-        depth = joined_depth(depths[index], linear_to_srgb(view.color), farthest)[..., None]
+        depth = joined_depth(depths[index], linear_to_srgb(color), farthest)[..., None]
         rays = camera.directions()
         places = camera.position + rays * depth / (rays @ camera.forward)[..., None]
         opacity = np.where(known, DISC_OPACITY, ELSEWHERE_OPACITY)[..., None]
-        table = np.concatenate([places, -rays, depth / camera.focal_x, opacity, view.color], axis=-1).reshape(-1, 11)
-        others = [(other.camera, seen) for other, seen in zip(small, depths, strict=True) if other is not view]
+        table = np.concatenate([places, -rays, depth / camera.focal_x, opacity, color], axis=-1).reshape(-1, 11)
+        others = [pair for other, pair in enumerate(zip(cameras, depths, strict=True)) if other != index]
         known = known.ravel()
         shown = known & seen_in_common(views, table[:, :3])
         rows.append(table[~shown & (known | ~_seen_through(table[:, :3], others))])
@@ -169,26 +164,6 @@ def _elsewhere(
     picked = table[np.sort(np.random.default_rng(seed).permutation(len(table))[:most])]
     picked[:, 6] *= np.sqrt(len(table) / max(len(picked), 1))
     return picked
-
-
-def _surface_depth(surface: GaussianCloud, camera: Camera, device: Any) -> NDArray[np.float32]:
-    """Return the depth of the outside of the surface [m], 0 where a view sees none of it, ``(H, W)``."""
-    assert surface.normals is not None
-    towards = camera.position - surface.positions
-    facing = (towards * surface.normals).sum(axis=1) > LEAST_FACING * np.linalg.norm(towards, axis=1)
-    shown = surface.select(np.flatnonzero(facing))
-    size = (camera.height, camera.width)
-    if not len(shown):
-        return np.zeros(size, np.float32)
-    gaussians = GaussianArrays(
-        upload(shown.positions, wp.vec3, device),
-        upload(shown.orientations, wp.quat, device),
-        upload(shown.scales, wp.vec3, device),
-        wp.full(len(shown), HIDING_OPACITY, dtype=float, device=device),
-    )
-    images = Rasterizer(len(shown), [camera], device=device).draw(gaussians)
-    depth = images.median_depth.numpy().reshape(size)
-    return np.where(images.alpha.numpy().reshape(size) > 0.5, depth, np.float32(0.0))
 
 
 def _seen_through(

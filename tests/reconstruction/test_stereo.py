@@ -37,8 +37,9 @@ def test_planes_are_where_the_scene_is(scene, planes):
 
 
 def test_the_surface_is_the_ball_on_its_floor(planes):
-    mesh = agreed_surface(planes)
-    assert mesh is not None
+    surface = agreed_surface(planes)
+    assert surface is not None
+    mesh = surface.mesh
     height = mesh.vertices[:, 2]
     on_ball = height > -0.2
     assert on_ball.sum() > 200
@@ -63,8 +64,7 @@ def test_nothing_in_common_is_no_surface(scene):
     rng = np.random.default_rng(0)
     small = [known.view.reduced(2) for known in scene[:3]]
     noise = [replace(view, color=rng.random(view.color.shape).astype(np.float32)) for view in small]
-    mesh = agreed_surface(find_planes(noise, 36 * 24))
-    assert mesh is None or mesh.area < 0.5
+    assert agreed_surface(find_planes(noise, 36 * 24)) is None
 
 
 def test_one_view_shows_no_depth(scene):
