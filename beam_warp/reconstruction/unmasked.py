@@ -24,6 +24,9 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 
+PIXELS_PER_DISC = 2
+"""Pixels of a view whose depth is found, for each Gaussian."""
+
 PIXELS = 30_000
 """Pixels to which a view is reduced, about, to join depths."""
 
@@ -63,7 +66,7 @@ def unmasked_gaussians(
         DeviceError: The device is not there.
     """
     require_count("count", count, 1, 2**26)
-    planes = find_planes(views, count, device=device, seed=seed)
+    planes = find_planes(views, PIXELS_PER_DISC * count, device=device, seed=seed)
     surface = agreed_surface(planes, device=device)
     if surface is None:
         return None
