@@ -77,7 +77,7 @@ def initial_gaussians(
     With masks, discs that lie evenly on the visual hull: local z is its outward normal. With ``points``, balls at them
     as large as the distance to their neighbours (Kerbl et al. 2023): some of them if there are more than ``count``,
     jittered copies if there are fewer. With neither, balls at random where the images of as many views as possible
-    overlap: the fallback of a capture without masks, from which only a long optimisation finds a surface.
+    overlap, from which only a long optimisation finds a surface; `beam_warp.reconstruction.unmasked` finds more.
 
     Colours are what most of the views that see a point agree on, towards which its normal turns.
 

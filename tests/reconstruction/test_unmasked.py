@@ -8,7 +8,7 @@ from beam_warp.image.color import linear_to_srgb
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.steps import FitAndTrack
+from beam_warp.reconstruction.steps import PLENTY, FitAndTrack
 from beam_warp.reconstruction.unmasked import ELSEWHERE_OPACITY, joined_depth, unmasked_gaussians
 
 COUNT = 3000
@@ -60,8 +60,11 @@ def test_discs_lie_on_the_surface(scene):
 
 def test_a_view_that_was_not_used(scene, device):
     held, used = scene[2], [known.view for i, known in enumerate(scene) if i != 2]
-    fitting = FitOptions(gaussian_count=COUNT, color_iterations=40, normal_iterations=80, samples=1, refine_every=60)
+    many = {"gaussian_count": 3000, "color_iterations": 40, "normal_iterations": 80}
+    asked = {name: value * PLENTY // len(used) for name, value in many.items()}
+    fitting = FitOptions(samples=1, refine_every=60, **asked)
     track, report = FitAndTrack(fitting=fitting, device=device).begin(used, no_progress)
+    assert report["iterations"] == 120
     drawn = rasterize(track.cloud, held.view.camera, channels=("radiance",), options=fitting.raster, device=device)
     color = np.clip(drawn.channels["radiance"] * drawn.alpha[..., None], 0.0, 1.0)
     off = linear_to_srgb(color) - linear_to_srgb(np.clip(held.view.color, 0.0, 1.0))
