@@ -213,7 +213,7 @@ class _Search:
             count = camera.width * camera.height
             planes, costs = wp.empty(count, dtype=wp.vec4, device=device), wp.empty(count, dtype=float, device=device)
             width = before[i].width if before else 0
-            stream = (self.seed * 64 + self.stage) * len(self.cameras) + i
+            stream = ((self.seed * 64 + self.stage) * len(self.cameras) + i) % 2**24
             launch_begin_planes(levels, depths, view, others, self.found[i], width, stream, planes, costs, device)
             for number in range(rounds):
                 spread = 0.5 ** (number + self.stage)

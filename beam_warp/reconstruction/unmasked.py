@@ -117,7 +117,7 @@ def joined_depth(depth: NDArray[np.floating], colors: NDArray[np.floating], fart
     if not known.all():
         ties = _ties(colors)
         system = (diags(np.asarray(ties.sum(axis=1)).ravel()) - ties).tocsr()[~known]
-        inverse[~known] = spsolve(system[:, ~known].tocsc(), -system[:, known] @ inverse[known])
+        inverse[~known] = np.asarray(spsolve(system[:, ~known].tocsc(), -(system[:, known] @ inverse[known])))
     return 1.0 / np.maximum(inverse, 1.0 / farthest).reshape(depth.shape)
 
 
@@ -170,7 +170,7 @@ def _elsewhere(
 
 
 def _seen_through(
-    places: NDArray[np.float64], others: Sequence[tuple[Camera, NDArray[np.floating]]]
+    places: NDArray[np.floating], others: Sequence[tuple[Camera, NDArray[np.floating]]]
 ) -> NDArray[np.bool_]:
     """Tell which places other views see the surface behind, ``(N,)``."""
     result = np.zeros(len(places), bool)

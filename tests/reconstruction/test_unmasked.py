@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.textured_scene import FLOOR, RADIUS, SHELL, arc_cameras, known_view
 
+from beam_warp.capture.capture import Capture
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.gbuffer import rasterize
@@ -72,3 +73,20 @@ def test_a_view_that_was_not_used(scene, device):
     assert psnr > 26.0  # the noise itself, grey against its lattice's 0.1 to 0.9, would be 13
     assert np.median(np.abs(drawn.median_depth - held.depth)[held.is_ball]) < 0.034  # a pixel's width
     assert report["gaussians"] >= len(track.cloud)
+
+
+@pytest.mark.slow
+def test_a_photograph_of_a_statue_that_was_not_used(data_dir, device):
+    """The statue fills the middle of the photograph; its exposure is its own, so that one factor is let pass."""
+    views = [record.view().reduced(6) for record in Capture.read(data_dir / "photos" / "buddha").records]
+    held = views.pop(3)
+    fitting = FitOptions.of_preset("draft", gaussian_count=18_000)
+    track, _ = FitAndTrack(fitting=fitting, device=device).begin(views, no_progress)
+    drawn = rasterize(track.cloud, held.camera, channels=("radiance",), options=fitting.raster, device=device)
+    middle = np.s_[held.camera.height // 3 : -held.camera.height // 3, held.camera.width // 3 : -held.camera.width // 3]
+    seen = (drawn.channels["radiance"] * drawn.alpha[..., None])[middle]
+    seen *= np.median(held.color[middle]) / np.median(seen)
+    off = linear_to_srgb(np.clip(seen, 0.0, 1.0)) - linear_to_srgb(np.clip(held.color[middle], 0.0, 1.0))
+    psnr = -10.0 * np.log10((off**2).mean())
+    print(psnr)
+    assert psnr > 20.0  # grey would be 19
