@@ -21,6 +21,7 @@ NO_IMAGES = "the captures have images; it counts only for Gaussians without"
 IMAGE_PATH = "only the image path uses it, the paper's recipe, which is not run here"
 LAMPS = "only lamps use it; relit views have none"
 EXACT_MASKS = "masks of these captures are exact, and stay as they are"
+MASKED = "these captures have masks; it counts only for photographs without"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 NO_SCORE = "it decides what is reported, and moves no score"
 BINARY = "a list of powers of two"
@@ -323,6 +324,34 @@ MATERIALS = (
         )
     ),
     *(
+        Constant(f"beam_warp.{place}", "photographs of a statue", does, MASKED)
+        for place, does in (
+            ("reconstruction.steps:PLENTY", "Photographs from which on all Gaussians and steps are spent."),
+            ("reconstruction.stereo:ROUNDS", "Times that pixels improve their planes at a level."),
+            ("reconstruction.stereo:AGREEMENTS", "Times that views look at each other's depths."),
+            ("reconstruction.stereo:MOST_NEIGHBORS", "Views that a view is compared with."),
+            ("reconstruction.stereo:WIDEST", "Angle between views that are compared [degree]."),
+            ("reconstruction.stereo:DEPTHS", "Depths that are looked for, over the distance of the middle."),
+            ("reconstruction.stereo:LARGEST_COST", "Cost up to which a plane counts."),
+            ("reconstruction.stereo:LARGEST_STEP", "Distance of neighbours from a plane [pixel]."),
+            ("reconstruction.stereo:LEAST_SHARE", "Part of an image that is a surface."),
+            ("reconstruction.stereo:SMALLEST_PART", "Parts of the surface that are left out."),
+            ("reconstruction.unmasked:PIXELS_PER_DISC", "Pixels of a view for each Gaussian."),
+            ("reconstruction.unmasked:ELSEWHERE_SHARE", "Most of the Gaussians beside the surface."),
+            ("reconstruction.unmasked:ELSEWHERE_OPACITY", "Opacity of discs whose depth is not known."),
+            ("reconstruction.unmasked:EDGE", "Difference of colours across which depth may jump."),
+            ("reconstruction.unmasked:LEAST_TIE", "Least tie of neighbouring pixels."),
+            ("reconstruction.unmasked:SEEN_THROUGH", "Part of the depth by which a disc is in front."),
+            ("kernels.reconstruction.patch_match:REACH", "Half the side of a patch [pixel]."),
+            ("kernels.reconstruction.patch_match:SPREAD", "Distance at which a sample counts 1/e [pixel]."),
+            ("kernels.reconstruction.patch_match:CONTRAST", "Difference at which a sample counts 1/e."),
+            ("kernels.reconstruction.patch_match:LEAST_VARIANCE", "Variance of a patch that says something."),
+            ("kernels.reconstruction.patch_match:LEAST_FACING", "Cosine at which a view sees a plane."),
+            ("kernels.reconstruction.patch_match:FARTHEST", "Most pixels of a miss that count."),
+            ("kernels.reconstruction.patch_match:PER_PIXEL", "Cost of a miss of a pixel."),
+        )
+    ),
+    *(
         Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, EXACT_RIGS)
         for name, does in (
             ("CERTAIN", "Corrections of a rig that are made [standard error]."),
@@ -490,6 +519,9 @@ UNTUNED = {
         beam_warp.reconstruction.rig: FEWEST_CAMERAS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
         beam_warp.reconstruction.rig: SHORTEST_SIDE
         beam_warp.reconstruction.alignment: NUMBERS
+        beam_warp.reconstruction.stereo: LEVELS SMALLEST_SIDE LEAST_PIXELS
+        beam_warp.reconstruction.unmasked: PIXELS
+        beam_warp.kernels.reconstruction.patch_match: STEP SIDE SAMPLES
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING
@@ -524,6 +556,7 @@ UNTUNED = {
         beam_warp.render.channels: MOST_GAUSSIANS TEXT_COLOR TEXT_SIZE LINE_HEIGHT MARGIN""",
     "numbers of cases and of columns": """
         beam_warp.kernels.reconstruction.visual_hull: OUTSIDE SURFACE INSIDE
+        beam_warp.kernels.reconstruction.patch_match: NEITHER WORST
         beam_warp.kernels.materials.residues: ALBEDO_SCALING FRESNEL_HV
         beam_warp.materials.direct: DIFFUSE_WEIGHTS
         beam_warp.kernels.materials.bounded_solve: WALK FREE SHIFT

@@ -77,7 +77,7 @@ def initial_gaussians(
     With masks, discs that lie evenly on the visual hull: local z is its outward normal. With ``points``, balls at them
     as large as the distance to their neighbours (Kerbl et al. 2023): some of them if there are more than ``count``,
     jittered copies if there are fewer. With neither, balls at random where the images of as many views as possible
-    overlap: the fallback of a capture without masks, from which only a long optimisation finds a surface.
+    overlap, from which only a long optimisation finds a surface; `beam_warp.reconstruction.unmasked` finds more.
 
     Colours are what most of the views that see a point agree on, towards which its normal turns.
 
@@ -130,13 +130,25 @@ def initial_gaussians(
 def _discs(views: Sequence[CapturedView], count: int, device: str, seed: int) -> GaussianCloud:
     """Return discs on the visual hull, with its normals."""
     mesh = visual_hull(views, device=device).mesh
-    positions, normals, spacing = even_surface_points(mesh, count, device=device, seed=seed)
+    return surface_discs(*even_surface_points(mesh, count, device=device, seed=seed))
+
+
+def surface_discs(
+    positions: NDArray[np.float32], normals: NDArray[np.float32], spacing: float | NDArray[np.float32]
+) -> GaussianCloud:
+    """Return discs on a surface, local z along its normals, ids from 0 on.
+
+    Args:
+        positions: Centres [m], ``(N, 3)``.
+        normals: Unit outward normals, ``(N, 3)``.
+        spacing: Distance to the neighbours [m], of all or of each, ``(N,)``.
+    """
+    count = len(positions)
+    parts = np.array([DISC_WIDTH, DISC_WIDTH, DISC_THICKNESS], np.float32)
     return GaussianCloud(
         positions=positions,
         orientations=_facing_orientations(normals),
-        scales=np.tile(
-            np.array([DISC_WIDTH, DISC_WIDTH, DISC_THICKNESS], np.float32) * np.float32(spacing), (count, 1)
-        ),
+        scales=np.broadcast_to(np.asarray(spacing, np.float32).reshape(-1, 1), (count, 1)) * parts,
         opacities=np.full(count, DISC_OPACITY, np.float32),
         normals=normals,
         ids=np.arange(count),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,11 +28,16 @@ from beam_warp.reconstruction.masks import mend_masks
 from beam_warp.reconstruction.photometry import find_exposures
 from beam_warp.reconstruction.rig import refine_rig
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
+from beam_warp.reconstruction.unmasked import seen_in_common, unmasked_gaussians
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 
 MOST_UNPAIRED = 0.5
 """Part of the Gaussians seen by fewer than two views above which there is a finding: most of the surface."""
+
+PLENTY = 24
+"""Photographs without masks from which on all Gaussians and steps are spent: each is then looked at as often as those
+of the captures that the schedule was chosen on."""
 
 STRUCTURE_REACH = 5
 """Half a window of structural similarity [pixel]: a Gaussian farther from its place has no gradient towards it. At the
@@ -96,14 +102,16 @@ class FitAndTrack:
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
         """Fit a key frame from its images alone, their exposures matched."""
-        start, findings, said = self._start(views), [], {}
+        is_bare = self.points is None and all(view.alpha is None for view in views)
+        fitting = _borne(self.fitting, len(views)) if is_bare else self.fitting
+        start, findings, said = self._start(views, fitting.gaussian_count), [], {}
         if all(view.alpha is not None for view in views):  # else it is no surface, and does not say who sees what
             up = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])  # outward, of discs on a hull
             gains = view_gains(start, outward_normals(start, up), views, device=self.device)
             findings = judge_gains(gains, views)
             if findings:
                 views = matched(views, gains)
-                start = self._start(views)  # of colours that agree
+                start = self._start(views, fitting.gaussian_count)  # of colours that agree
             unpaired = float((gains.views_of_points < 2).mean())
             said = {**_exposures(gains), "unpaired": unpaired}
             if unpaired > MOST_UNPAIRED:
@@ -112,8 +120,12 @@ class FitAndTrack:
                     "outlines"
                 )
                 findings.append(Finding("warning", "few-cameras", what, remedy="Add cameras."))
-        fit = fit_gaussians(views, start, self.fitting, device=self.device, progress=progress)
-        track = begin_track(fit.cloud, views, self._tracking, device=self.device)
+        fit = fit_gaussians(views, start, fitting, device=self.device, progress=progress)
+        cloud = fit.cloud
+        if is_bare:
+            inner = np.flatnonzero(seen_in_common(views, cloud.positions))
+            cloud = cloud.select(inner) if len(inner) else cloud
+        track = begin_track(cloud, views, self._tracking, device=self.device)
         return track, {**fit.report, **said, "findings": [vars(finding) for finding in findings]}
 
     def advance(
@@ -150,21 +162,33 @@ class FitAndTrack:
         }
         return following, {**report, **said}
 
-    def _start(self, views: Sequence[CapturedView]) -> GaussianCloud:
-        """Return the Gaussians that a fit begins with."""
+    def _start(self, views: Sequence[CapturedView], count: int) -> GaussianCloud:
+        """Return the Gaussians that a fit begins with: of a visual hull, known points, or what photographs agree on."""
+        seed = self.fitting.seed
         known = None if all(view.alpha is not None for view in views) else self.points  # a visual hull says more
+        if known is None and len(views) > 1 and all(view.alpha is None for view in views):
+            agreed = unmasked_gaussians(views, count, device=self.device, seed=seed)
+            if agreed is not None:
+                return agreed
         return initial_gaussians(
             views,
-            self.fitting.gaussian_count,
+            count,
             points=None if known is None else known.positions,
             point_colors=None if known is None else known.colors,
             device=self.device,
-            seed=self.fitting.seed,
+            seed=seed,
         )
 
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""
         return Track.from_arrays(arrays)
+
+
+def _borne(options: FitOptions, view_count: int) -> FitOptions:
+    """Return what photographs without masks bear: more Gaussians and steps would paint each of a few for itself."""
+    share = min(1.0, view_count / PLENTY)
+    names = ("gaussian_count", "color_iterations", "normal_iterations")
+    return replace(options, **{name: math.ceil(share * getattr(options, name)) for name in names})
 
 
 def _exposures(gains: ViewGains) -> dict[str, float]:
