@@ -22,6 +22,7 @@ IMAGE_PATH = "only the image path uses it, the paper's recipe, which is not run 
 LAMPS = "only lamps use it; relit views have none"
 EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 MASKED = "these captures have masks; it counts only for photographs without"
+EXACT_EXPOSURES = "exposures of these captures are equal, and colours stay as they are"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 NO_SCORE = "it decides what is reported, and moves no score"
 BINARY = "a list of powers of two"
@@ -86,6 +87,7 @@ RECONSTRUCTION = (
     Constant(FIT + "FitOptions.weights.ssim", "3DGS", "Weight of structural similarity."),
     Constant(FIT + "FitOptions.weights.alpha", WALKER, "Weight of coverage."),
     Constant(FIT + "FitOptions.weights.normal", WALKER, "Weight of normals against the drawn depth's."),
+    Constant(FIT + "FitOptions.weights.normal_tolerance", "walker, runner, robot", "Angle of an edge [rad]."),
     Constant(FIT + "FitOptions.rates.positions", WALKER, "Step of positions, in distances of the cameras."),
     Constant(FIT + "FitOptions.rates.orientations", WALKER, "Step of orientations."),
     Constant(FIT + "FitOptions.rates.scales", WALKER, "Step of the logarithms of scales."),
@@ -324,6 +326,17 @@ MATERIALS = (
         )
     ),
     *(
+        Constant(f"beam_warp.reconstruction.photometry:{name}", "walker, runner, robot", does, EXACT_EXPOSURES)
+        for name, does in (
+            ("LEVELS", "Levels of roughness whose highlights explain those of all others."),
+            ("NEIGHBORS", "Gaussians over which normals are averaged."),
+            ("DARKEST", "Colour of points that are left out, of the median."),
+            ("LEAST_CHANCE", "Least probability of a roughness."),
+            ("LEAST_SPREAD", "Least standard deviation of a colour."),
+            ("FIT_GAUSSIANS", "Gaussians of the surface at which views are compared."),
+        )
+    ),
+    *(
         Constant(f"beam_warp.{place}", "photographs of a statue", does, MASKED)
         for place, does in (
             ("reconstruction.steps:PLENTY", "Photographs from which on all Gaussians and steps are spent."),
@@ -486,6 +499,7 @@ UNTUNED = {
         beam_warp.materials.light_turn: TURNS
         beam_warp.reconstruction.masks: FEWEST_VIEWS SIDE SAMPLES WINDOW
         beam_warp.reconstruction.rig: MOST_LEFT_OUT
+        beam_warp.reconstruction.photometry: CHANCE COSINES
         beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
@@ -505,7 +519,8 @@ UNTUNED = {
         PathOptions: samples seed""",
     "not used, or another option's": """
         FitOptions: raster.near temporal
-        TrackOptions: joints.weights.normal refinement.weights refinement.raster refinement.sh_degree refinement.seed
+        TrackOptions: joints.weights.normal joints.weights.normal_tolerance
+        TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every
         TrackOptions: refinement.refine_until refinement.split_fraction refinement.hidden_share refinement.dead_opacity
         BakeOptions: passes ridge temporal low high""",
@@ -522,6 +537,8 @@ UNTUNED = {
         beam_warp.reconstruction.stereo: LEVELS SMALLEST_SIDE LEAST_PIXELS
         beam_warp.reconstruction.unmasked: PIXELS
         beam_warp.kernels.reconstruction.patch_match: STEP SIDE SAMPLES
+        beam_warp.reconstruction.photometry: FEWEST_CAMERAS FEWEST_POINTS MOST_POINTS LEAST_VIEWS ROUNDS SETTLED
+        beam_warp.reconstruction.photometry: LARGEST_SIDE
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING

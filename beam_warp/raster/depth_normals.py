@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,10 @@ from beam_warp.kernels.raster.depth_normals import (
 )
 from beam_warp.world.camera import Camera
 
+STEEPEST = 84.0
+"""Tilt against the image plane from which on neighbours are taken for two surfaces, one before the other [degree].
+Ledges of a few pixels' depth must not count as slopes: the Gaussians would fill them."""
+
 
 class DepthNormals:
     """Normals of depth images of one camera, by central differences over one pixel to each side.
@@ -28,8 +33,7 @@ class DepthNormals:
     - has no depth: one that is not finite, or not above 1e-6 m, or
     - lies across an edge: its depth differs from the middle pixel's by more than ``largest_jump`` times that depth.
       Opposite neighbours so differ by at most twice as much, over two pixels. A surface that is tilted by t against
-      the image plane, near the image's centre, changes by tan(t) / focal length of its depth from pixel to pixel: at
-      a focal length of 500 pixels, 3 % is a tilt of 86 degrees.
+      the image plane, near the image's centre, changes by tan(t) / focal length of its depth from pixel to pixel.
 
     Nothing is allocated, nothing waits for the device: calls may be captured in a CUDA graph.
 
@@ -37,14 +41,15 @@ class DepthNormals:
     """
 
     def __init__(
-        self, camera: Camera, *, minimum_alpha: float = 0.5, largest_jump: float = 0.03, device: Any = None
+        self, camera: Camera, *, minimum_alpha: float = 0.5, largest_jump: float | None = None, device: Any = None
     ) -> None:
         """Prepare a camera.
 
         Args:
             camera: Its size is that of every image.
             minimum_alpha: Pixels count above it; in [0, 1].
-            largest_jump: Largest step of depth between neighbours, as a fraction of the depth; infinite for any.
+            largest_jump: Largest step of depth between neighbours, as a fraction of the depth; infinite for any; None
+                for that of a surface tilted by `STEEPEST`.
             device: Warp device; the first GPU without, or the CPU where there is none.
 
         Raises:
@@ -59,7 +64,8 @@ class DepthNormals:
         view.focal = wp.vec2(camera.focal_x, camera.focal_y)
         view.center = wp.vec2(camera.center_x, camera.center_y)
         view.minimum_alpha = require_number("minimum_alpha", minimum_alpha, 0.0, 1.0)
-        view.largest_jump = require_number("largest_jump", largest_jump, 0.0)
+        steepest = math.tan(math.radians(STEEPEST)) / min(camera.focal_x, camera.focal_y)
+        view.largest_jump = require_number("largest_jump", steepest if largest_jump is None else largest_jump, 0.0)
         self._view = view
 
     def write(self, depth: Any, alpha: Any, normals: wp.array) -> None:

@@ -169,30 +169,40 @@ class NormalLoss(_Term):
         *,
         weight: float = 1.0,
         mask: Any = None,
+        tolerance: float = math.inf,
         rendered_gradient: wp.array | None = None,
         expected_gradient: wp.array | None = None,
     ) -> wp.array:
-        """Return weight * sum over pixels of mask * (1 - rendered . expected / |rendered|) / (H W), and add gradients.
+        """Return weight * sum over pixels of mask * t (sqrt(t^2 + 2 d) - t) / (H W), and add gradients.
 
-        Pixels where ``expected`` is 0, or ``rendered`` shorter than 0.001, add 0 to the sum and have no gradient.
+        d is 1 - rendered . expected / |rendered|, half the squared chord between the normals, and t the tolerance: what
+        differs by less counts by the square of the angle, what differs by more by the angle, so that an edge is not
+        smoothed for the sake of its few pixels. An infinite tolerance gives d itself. Pixels where ``expected`` is 0,
+        or ``rendered`` shorter than 0.001, add 0 to the sum and have no gradient.
 
         Args:
             rendered: Normals as composited, of any length, ``(H, W, 3)`` float32.
             expected: Unit normals or 0, such as `DepthNormals` writes, in the same axes.
             weight: The factor of the term, at least 0.
             mask: Weight of each pixel, ``(H, W)`` float32, such as alpha; 1 without. It has no gradient.
+            tolerance: Angle [rad], above 0.
             rendered_gradient: The derivative with respect to ``rendered``, through its normalisation, is added to it.
             expected_gradient: The derivative with respect to ``expected``, taken as it is, is added to it.
 
         Raises:
             InvalidArrayError: An array has another type, shape or device.
-            InvalidOptionError: ``weight`` is negative.
+            InvalidOptionError: ``weight`` is negative, or ``tolerance`` not above 0.
+
+        Source: d, BEAM Eq. 2; its growth, Charbonnier et al. 1994.
         """
         scale = _scale(weight, self.shape[:2])
+        if not tolerance > 0.0:
+            raise InvalidOptionError(f"tolerance must be above 0, got {tolerance}. Pass an angle in radians.")
         launch_add_normal(
             self._input("rendered", rendered),
             self._input("expected", expected),
             self._mask(mask),
+            tolerance**-2.0,
             scale,
             self._terms,
             self._output("rendered_gradient", rendered_gradient),

@@ -16,6 +16,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_number
 from beam_warp.device.array_checks import pixel_channels
 from beam_warp.device.arrays import upload
+from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
@@ -52,21 +53,28 @@ class LossWeights:
         l1: Mean absolute difference of encoded colours.
         ssim: One minus the structural similarity of encoded colours.
         alpha: Mean absolute difference of coverage, where it is known.
-        normal: Disagreement of the Gaussians' normals with those of the drawn depth (BEAM Eq. 2).
+        normal: Disagreement of the Gaussians' normals with those of the drawn depth.
+        normal_tolerance: Angle from which on it counts no more by its square [rad], see
+            `beam_warp.raster.losses.NormalLoss`; infinite: always by its square (BEAM Eq. 2).
 
     Raises:
-        InvalidOptionError: A weight is negative or no number.
+        InvalidOptionError: A weight is negative or no number, or the tolerance is not above 0.
     """
 
     l1: float = 0.8
     ssim: float = 0.2
     alpha: float = 0.5
     normal: float = 0.0
+    normal_tolerance: float = math.inf
 
     def __post_init__(self) -> None:
         """Check every weight once; a term that counts 0 is left out, and NaN must not pass for it."""
         for name in ("l1", "ssim", "alpha", "normal"):
             require_number(name, getattr(self, name), 0.0)
+        if not self.normal_tolerance > 0.0:
+            raise InvalidOptionError(
+                f"normal_tolerance must be above 0, got {self.normal_tolerance}. Pass an angle in radians."
+            )
 
 
 def crop_views(views: Sequence[CapturedView]) -> list[CapturedView]:
@@ -214,6 +222,7 @@ class ViewTargets:
                     self._surface,
                     weight=weights.normal,
                     mask=self._coverage,
+                    tolerance=weights.normal_tolerance,
                     rendered_gradient=self._to_normal,
                     expected_gradient=self._to_surface,
                 )

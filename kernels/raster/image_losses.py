@@ -64,11 +64,13 @@ def add_normal_kernel(
     rendered: wp.array3d[float],
     expected: wp.array3d[float],
     mask: wp.array2d[float],
+    bluntness: float,
     scale: float,
     out_terms: wp.array[float],
     out_rendered_gradient: wp.array3d[float],
     out_expected_gradient: wp.array3d[float],
 ):
+    """``bluntness`` is one over the tolerance squared: 0 takes 1 - cosine as it is."""
     pixel = first + wp.tid()
     x = pixel % rendered.shape[1]
     y = pixel / rendered.shape[1]
@@ -81,8 +83,10 @@ def add_normal_kernel(
         return
     direction = normal / length
     cosine = wp.dot(direction, other)
-    out_terms[pixel] = weight * (1.0 - cosine)
-    upstream = -scale * weight
+    disagreement = wp.max(1.0 - cosine, 0.0)
+    root = wp.sqrt(1.0 + 2.0 * bluntness * disagreement)
+    out_terms[pixel] = weight * 2.0 * disagreement / (1.0 + root)
+    upstream = -scale * weight / root
     if out_rendered_gradient:
         add_vector(out_rendered_gradient, y, x, (upstream / length) * (other - direction * cosine))
     if out_expected_gradient:
@@ -95,8 +99,10 @@ def launch_add_l1(image, target, mask, scale, out_terms, out_gradient, device):
     launch(add_l1_kernel, out_terms.size, inputs=inputs, outputs=[out_terms, out_gradient], device=device)
 
 
-def launch_add_normal(rendered, expected, mask, scale, out_terms, out_rendered_gradient, out_expected_gradient, device):
+def launch_add_normal(
+    rendered, expected, mask, bluntness, scale, out_terms, out_rendered_gradient, out_expected_gradient, device
+):
     """Write every pixel's disagreement of normals, and add ``scale`` times its gradients."""
-    inputs = [rendered, expected, mask, scale]
+    inputs = [rendered, expected, mask, bluntness, scale]
     outputs = [out_terms, out_rendered_gradient, out_expected_gradient]
     launch(add_normal_kernel, out_terms.size, inputs=inputs, outputs=outputs, device=device)

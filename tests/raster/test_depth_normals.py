@@ -18,7 +18,8 @@ def camera_of(width, height, focal=80.0):
     return Camera(width, height, focal, 1.1 * focal, 0.45 * width, 0.56 * height, seen.camera_to_world)
 
 
-def normals_of(depth, camera, device, alpha=None, **options):
+def normals_of(depth, camera, device, alpha=None, *, largest_jump=0.03, **options):
+    options |= {"largest_jump": largest_jump}
     shape = (camera.height, camera.width)
     normals = wp.full((*shape, 3), 7.0, dtype=float, device=device)
     alpha = np.ones(shape) if alpha is None else alpha
@@ -26,7 +27,8 @@ def normals_of(depth, camera, device, alpha=None, **options):
     return normals.numpy()
 
 
-def gradients_of(depth, camera, upstream, device, alpha=None, **options):
+def gradients_of(depth, camera, upstream, device, alpha=None, *, largest_jump=0.03, **options):
+    options |= {"largest_jump": largest_jump}
     gradients = wp.zeros(depth.shape, dtype=float, device=device)
     alpha = np.ones(depth.shape) if alpha is None else alpha
     DepthNormals(camera, device=device, **options).add_gradients(
@@ -138,6 +140,13 @@ class TestMasks:
         assert there[1:-1, 11:-1].all()
         wide = np.abs(normals_of(depth, camera, device, largest_jump=np.inf)).max(axis=-1) > 0.0
         assert wide[1:-1, 1:-1].all()
+
+    @pytest.mark.parametrize(("tilt", "is_surface"), [(83.0, True), (85.0, False)])
+    def test_steep_surfaces_count_and_ledges_do_not(self, device, tilt, is_surface):
+        camera = Camera(20, 16, 400.0, 400.0, 10.0, 8.0, np.eye(4))
+        depth = 2.0 * np.exp(np.tan(np.radians(tilt)) / 400.0 * np.arange(20))[None].repeat(16, axis=0)
+        there = np.abs(normals_of(depth, camera, device, largest_jump=None)).max(axis=-1) > 0.0
+        assert (there[1:-1, 1:-1] == is_surface).all()
 
     @pytest.mark.parametrize(
         ("broken", "largest_jump"),

@@ -115,7 +115,8 @@ class TestNormal:
         assert to_rendered.numpy()[1, 2] == pytest.approx([-np.sin(angle) / 0.4, 0.0, 0.0], abs=16.0 * EPSILON)
         assert to_expected.numpy()[1, 2] == pytest.approx([0.0, 0.0, -1.0], abs=4.0 * EPSILON)
 
-    def test_twin(self, device, rng):
+    @pytest.mark.parametrize("tolerance", [np.inf, 0.1])
+    def test_twin(self, device, rng, tolerance):
         expected = unit(rng, 9, 8).astype(np.float32).astype(float)
         expected[2:4, 3] = 0.0
         rendered = (unit(rng, 9, 8) * rng.uniform(0.2, 1.0, (9, 8, 1))).astype(np.float32).astype(float)
@@ -123,18 +124,41 @@ class TestNormal:
         mask = rng.uniform(size=(9, 8)).astype(np.float32)
         to_rendered, to_expected = zeros((9, 8, 3), device), zeros((9, 8, 3), device)
         loss = NormalLoss(9, 8, device=device)(
-            rendered, expected, weight=0.03, mask=mask, rendered_gradient=to_rendered, expected_gradient=to_expected
+            rendered,
+            expected,
+            weight=0.03,
+            mask=mask,
+            tolerance=tolerance,
+            rendered_gradient=to_rendered,
+            expected_gradient=to_expected,
         )
-        assert value(loss) == pytest.approx(0.03 * twin.normal(rendered, expected, mask), rel=16.0 * EPSILON)
+        assert value(loss) == pytest.approx(0.03 * twin.normal(rendered, expected, mask, tolerance), rel=16.0 * EPSILON)
         # where a normal is 0 it is left out, and a difference would step over that decision
         counted = (np.abs(rendered).max(-1) > 0.0) & (np.abs(expected).max(-1) > 0.0)
         frozen = mask * counted
-        slope = 0.03 * twin.slope(lambda moved: twin.normal(moved, expected, frozen), rendered)
+        slope = 0.03 * twin.slope(lambda moved: twin.normal(moved, expected, frozen, tolerance), rendered)
         assert relative_error(to_rendered.numpy(), slope) <= 1e-6
-        slope = 0.03 * twin.slope(lambda moved: twin.normal(rendered, moved, frozen), expected)
+        slope = 0.03 * twin.slope(lambda moved: twin.normal(rendered, moved, frozen, tolerance), expected)
         assert relative_error(to_expected.numpy(), slope) <= 1e-6
         assert (to_rendered.numpy()[~counted] == 0.0).all()
         assert (to_expected.numpy()[~counted] == 0.0).all()
+
+    def test_what_differs_by_more_than_the_tolerance_counts_by_its_angle(self, device):
+        rendered = np.tile([0.0, 0.0, 1.0], (1, 2, 1))
+        found = []
+        for angle in (1e-3, 1.0):
+            expected = np.tile([np.sin(angle), 0.0, np.cos(angle)], (1, 2, 1))
+            to_rendered = zeros((1, 2, 3), device)
+            NormalLoss(1, 2, device=device)(rendered, expected, tolerance=0.1, rendered_gradient=to_rendered)
+            found.append(-2.0 * to_rendered.numpy()[0, 0, 0])
+        # of small angles the slope is the angle; of large ones the tolerance, times the cosine of half the angle
+        assert found[0] == pytest.approx(1e-3, rel=1e-3)
+        assert found[1] == pytest.approx(0.1 * np.cos(0.5), rel=0.01)
+
+    @pytest.mark.parametrize("tolerance", [0.0, -1.0, np.nan])
+    def test_tolerances_are_above_0(self, tolerance):
+        with pytest.raises(InvalidOptionError, match="tolerance must be above 0, got"):
+            NormalLoss(1, 1, device="cpu")(np.ones((1, 1, 3)), np.ones((1, 1, 3)), tolerance=tolerance)
 
     @pytest.mark.parametrize("broken", [0.0, 5e-4, np.nan])
     def test_pixels_without_a_direction(self, device, broken):

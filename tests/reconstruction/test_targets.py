@@ -14,6 +14,7 @@ from support.moving_ball import ball_cloud, ball_views, block_means, rig
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
+from beam_warp.raster.depth_normals import STEEPEST
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.parameters import GaussianParameters
@@ -146,7 +147,8 @@ class Twin:
         self.decisions = decide(scene)
         drawn = replay(scene, self.decisions)
         self.mask = drawn.alpha
-        self.found = has_normal(drawn.depth, drawn.alpha)
+        focal = min(view.camera.focal_x, view.camera.focal_y) * samples
+        self.found = has_normal(drawn.depth, drawn.alpha, largest_jump=np.tan(np.radians(STEEPEST)) / focal)
 
     def scene(self, rows):
         scales, opacities = activate(rows["log_scales"], rows["logits"], self.filters, self.thin)
@@ -171,7 +173,7 @@ class Twin:
         alpha = block_means(drawn.alpha, self.samples)
         total += weights.alpha * image_losses.l1(alpha, self.view.alpha[..., None].astype(np.float64), everywhere)
         surface = depth_normals(drawn.depth, self.view.camera.supersampled(self.samples), self.found)
-        return total + weights.normal * image_losses.normal(drawn.normals, surface, self.mask)
+        return total + weights.normal * image_losses.normal(drawn.normals, surface, self.mask, weights.normal_tolerance)
 
     def gradient(self, name, step=1e-6):
         return image_losses.slope(lambda moved: self.loss(**{name: moved}), self.rows[name], step)
@@ -181,7 +183,7 @@ class Twin:
     ("size", "samples", "weights"),
     [
         ((19, 14), 1, LossWeights(normal=0.3)),
-        ((17, 11), 2, LossWeights(normal=0.3)),
+        ((17, 11), 2, LossWeights(normal=0.3, normal_tolerance=0.1)),
         ((19, 14), 2, LossWeights(l1=0.0, ssim=0.0, alpha=0.0, normal=1.0)),
     ],
 )

@@ -27,11 +27,13 @@ def ssim(image, target, mask):
     return (mask[..., None] * (1.0 - similarity(image, target))).sum() / image.size
 
 
-def normal(rendered, expected, mask):
+def normal(rendered, expected, mask, tolerance=np.inf):
     length = np.linalg.norm(rendered, axis=-1)
     counted = (length > 1e-3) & (np.abs(expected).max(axis=-1) > 0.0)
     cosine = (rendered * expected).sum(axis=-1) / np.where(counted, length, 1.0)
-    return (mask * np.where(counted, 1.0 - cosine, 0.0)).sum() / mask.size
+    chord = 2.0 * (1.0 - cosine)
+    term = 0.5 * chord if np.isinf(tolerance) else tolerance * (np.sqrt(tolerance**2 + chord) - tolerance)
+    return (mask * np.where(counted, term, 0.0)).sum() / mask.size
 
 
 def slope(loss, array, step=1e-5):
