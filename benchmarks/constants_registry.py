@@ -538,7 +538,7 @@ UNTUNED = {
         beam_warp.reconstruction.unmasked: PIXELS
         beam_warp.kernels.reconstruction.patch_match: STEP SIDE SAMPLES
         beam_warp.reconstruction.photometry: FEWEST_CAMERAS FEWEST_POINTS MOST_POINTS LEAST_VIEWS ROUNDS SETTLED
-        beam_warp.reconstruction.photometry: LARGEST_SIDE
+        beam_warp.reconstruction.photometry: LARGEST_SIDE LEAST_VARIANCE
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING
