@@ -55,7 +55,7 @@ class LossWeights:
         alpha: Mean absolute difference of coverage, where it is known.
         normal: Disagreement of the Gaussians' normals with those of the drawn depth.
         normal_tolerance: Angle from which on it counts no more by its square [rad], see
-            `beam_warp.raster.losses.NormalLoss`; infinite: always by its square (BEAM Eq. 2).
+            `beam_warp.raster.losses.NormalLoss`; None: always by its square (BEAM Eq. 2).
 
     Raises:
         InvalidOptionError: A weight is negative or no number, or the tolerance is not above 0.
@@ -65,13 +65,13 @@ class LossWeights:
     ssim: float = 0.2
     alpha: float = 0.5
     normal: float = 0.0
-    normal_tolerance: float = math.inf
+    normal_tolerance: float | None = None
 
     def __post_init__(self) -> None:
         """Check every weight once; a term that counts 0 is left out, and NaN must not pass for it."""
         for name in ("l1", "ssim", "alpha", "normal"):
             require_number(name, getattr(self, name), 0.0)
-        if not self.normal_tolerance > 0.0:
+        if self.normal_tolerance is not None and not self.normal_tolerance > 0.0:
             raise InvalidOptionError(
                 f"normal_tolerance must be above 0, got {self.normal_tolerance}. Pass an angle in radians."
             )
@@ -222,7 +222,7 @@ class ViewTargets:
                     self._surface,
                     weight=weights.normal,
                     mask=self._coverage,
-                    tolerance=weights.normal_tolerance,
+                    tolerance=weights.normal_tolerance or math.inf,
                     rendered_gradient=self._to_normal,
                     expected_gradient=self._to_surface,
                 )

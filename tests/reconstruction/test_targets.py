@@ -173,7 +173,9 @@ class Twin:
         alpha = block_means(drawn.alpha, self.samples)
         total += weights.alpha * image_losses.l1(alpha, self.view.alpha[..., None].astype(np.float64), everywhere)
         surface = depth_normals(drawn.depth, self.view.camera.supersampled(self.samples), self.found)
-        return total + weights.normal * image_losses.normal(drawn.normals, surface, self.mask, weights.normal_tolerance)
+        return total + weights.normal * image_losses.normal(
+            drawn.normals, surface, self.mask, weights.normal_tolerance or np.inf
+        )
 
     def gradient(self, name, step=1e-6):
         return image_losses.slope(lambda moved: self.loss(**{name: moved}), self.rows[name], step)
