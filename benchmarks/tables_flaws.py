@@ -28,6 +28,27 @@ def flaws(result: Row) -> Rows:
     return [head, *(_cells(label, rows) for label, rows in _groups(result))]
 
 
+@table("flaws_studio", "flaws_studio_h200.json")
+def studio(result: Row) -> Rows:
+    """Return the scores of clean captures and of those with all of a studio's flaws, means over seeds."""
+    return flaws(result)
+
+
+@table("flaws_mended", "flaws_studio_h200.json")
+def mended(result: Row) -> Rows:
+    """Return what is left of the flaws of rigs after their correction, beside what was there, means over seeds."""
+    keys = ("pose_pixels", "pose_mm")
+    head = ["what is wrong", "poses before [pixel]", "after", "places before [mm]", "after"]
+    head += ["exposure left [%]", "white balance left [%]"]
+    rows: list[list[Any]] = [head]
+    for label, found in _groups(result):
+        cells = [f"{_mean(found, 'recovered', key + end):.2g}" for key in keys for end in ("_injected", "")]
+        left = [f"{100 * _mean(found, 'recovered', key):.2g}" for key in ("exposure_error", "white_balance_error")]
+        if found[0]["case"]["flaw"] != "clean":
+            rows.append([label, *cells, *left])
+    return rows
+
+
 @table("flaws_recovered", "flaws_h200.json")
 def recovered(result: Row) -> Rows:
     """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""

@@ -200,6 +200,35 @@ def light_check(result: Row) -> Rows:
     return rows
 
 
+@table("geometry_budget", "geometry_budget_h200.json")
+def geometry_budget(result: Row) -> Rows:
+    """Return the drawn occlusion of every combination of true and found places, normals and occluders, by capture."""
+    captures = result["captures"]
+    return [
+        ["ambient occlusion [dB]", *captures],
+        *(
+            [row, *(f"{found['rows'][row]['psnr']:.1f}" for found in captures.values())]
+            for row in captures["robot"]["rows"]
+        ),
+    ]
+
+
+@table("geometry_places", "geometry_budget_h200.json")
+def geometry_places(result: Row) -> Rows:
+    """Return shares, signed distances and angles of the pixels beside each kind of edge, by capture."""
+    kinds = ("flat", "beside a crease", "beside a ridge", "beside a ledge")
+    rows: Rows = [
+        ["", "of all pixels", "distance to the true surface [mm]: tenth, median, ninetieth", "normals: median, mean"]
+    ]
+    for name, found in result["captures"].items():
+        for kind in kinds:
+            place = found["places"][kind]
+            signed = ", ".join(f"{value:+.1f}" for value in place["signed_mm"])
+            middle, _, mean = place["normal_degrees"]
+            rows.append([f"{name}, {kind}", f"{100 * place['share']:.0f} %", signed, f"{middle:.1f}°, {mean:.1f}°"])
+    return rows
+
+
 @table("light_turn", "light_turn_cpu.json")
 def light_turn(result: Row) -> Rows:
     """Errors of turns in both halves of the points, and scales by highlights of each roughness."""

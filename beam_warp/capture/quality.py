@@ -206,7 +206,7 @@ def photon_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
 def _relative_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
     """Return the standard deviation of a channel over its value, in the middle of the subject's levels."""
     level = float(np.median(color[solid])) if solid.any() else 0.0
-    return float(np.sqrt(photon_noise(color, solid) / level)) if level > 0.0 else np.nan
+    return float(np.sqrt(np.maximum(photon_noise(color, solid), 0.0) / level)) if level > 0.0 else np.nan
 
 
 def _some(places: NDArray[np.int64], most: int) -> NDArray[np.int64]:
