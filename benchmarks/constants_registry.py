@@ -519,7 +519,7 @@ UNTUNED = {
         PathOptions: samples seed""",
     "not used, or another option's": """
         FitOptions: raster.near temporal
-        TrackOptions: joints.weights.normal joints.weights.normal_tolerance
+        TrackOptions: joints.weights.normal
         TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every
         TrackOptions: refinement.refine_until refinement.split_fraction refinement.hidden_share refinement.dead_opacity

@@ -22,6 +22,9 @@ STEEPEST = 84.0
 """Tilt against the image plane from which on neighbours are taken for two surfaces, one before the other [degree].
 Ledges of a few pixels' depth must not count as slopes: the Gaussians would fill them."""
 
+LARGEST_JUMP = 0.03
+"""Part of the depth that neighbours of one surface differ by at most, however wide pixels are."""
+
 
 class DepthNormals:
     """Normals of depth images of one camera, by central differences over one pixel to each side.
@@ -49,7 +52,7 @@ class DepthNormals:
             camera: Its size is that of every image.
             minimum_alpha: Pixels count above it; in [0, 1].
             largest_jump: Largest step of depth between neighbours, as a fraction of the depth; infinite for any; None
-                for that of a surface tilted by `STEEPEST`.
+                for that of a surface tilted by `STEEPEST`, `LARGEST_JUMP` at most.
             device: Warp device; the first GPU without, or the CPU where there is none.
 
         Raises:
@@ -65,7 +68,8 @@ class DepthNormals:
         view.center = wp.vec2(camera.center_x, camera.center_y)
         view.minimum_alpha = require_number("minimum_alpha", minimum_alpha, 0.0, 1.0)
         steepest = math.tan(math.radians(STEEPEST)) / min(camera.focal_x, camera.focal_y)
-        view.largest_jump = require_number("largest_jump", steepest if largest_jump is None else largest_jump, 0.0)
+        chosen = min(LARGEST_JUMP, steepest) if largest_jump is None else largest_jump
+        view.largest_jump = require_number("largest_jump", chosen, 0.0)
         self._view = view
 
     def write(self, depth: Any, alpha: Any, normals: wp.array) -> None:

@@ -14,7 +14,7 @@ from support.moving_ball import ball_cloud, ball_views, block_means, rig
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
-from beam_warp.raster.depth_normals import STEEPEST
+from beam_warp.raster.depth_normals import LARGEST_JUMP, STEEPEST
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.parameters import GaussianParameters
@@ -148,7 +148,9 @@ class Twin:
         drawn = replay(scene, self.decisions)
         self.mask = drawn.alpha
         focal = min(view.camera.focal_x, view.camera.focal_y) * samples
-        self.found = has_normal(drawn.depth, drawn.alpha, largest_jump=np.tan(np.radians(STEEPEST)) / focal)
+        self.found = has_normal(
+            drawn.depth, drawn.alpha, largest_jump=min(LARGEST_JUMP, np.tan(np.radians(STEEPEST)) / focal)
+        )
 
     def scene(self, rows):
         scales, opacities = activate(rows["log_scales"], rows["logits"], self.filters, self.thin)
