@@ -49,7 +49,7 @@ def mended(result: Row) -> Rows:
     return rows
 
 
-@table("flaws_recovered", "flaws_h200.json")
+@table("flaws_recovered", "flaws_studio_h200.json")
 def recovered(result: Row) -> Rows:
     """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""
     head = ["what is wrong", "light made brighter [stop]", "should be", "largest exposure found [stop]", "injected"]

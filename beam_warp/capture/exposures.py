@@ -131,15 +131,14 @@ class RigExposures:
             ) from error
 
 
-def read_exposures(folder: Path, key: str | None = None) -> RigExposures | None:
+def read_exposures(folder: Path) -> RigExposures | None:
     """Read the exposures beside a reconstruction.
 
     Args:
         folder: Folder of the reconstruction.
-        key: Key of what they must have been found from; None for any.
 
     Returns:
-        The exposures; None if there are none, or none of that key.
+        The exposures; None if there are none.
 
     Raises:
         AssetFormatError: The file is damaged.
@@ -147,9 +146,7 @@ def read_exposures(folder: Path, key: str | None = None) -> RigExposures | None:
     path = folder / FILE_NAME
     if not path.is_file():
         return None
-    content = read_json(path, "exposures of cameras", MOST_BYTES)
-    found = RigExposures.from_dict(content, path)
-    return found if key is None or content.get("key") == key else None
+    return RigExposures.from_dict(read_json(path, "exposures of cameras", MOST_BYTES), path)
 
 
 def _spread(values: ArrayLike) -> float:

@@ -80,15 +80,14 @@ class MaskCorrections:
         return cls(offsets)
 
 
-def read_mask_corrections(folder: Path, key: str | None = None) -> MaskCorrections | None:
+def read_mask_corrections(folder: Path) -> MaskCorrections | None:
     """Read the corrections beside a reconstruction.
 
     Args:
         folder: Folder of the reconstruction.
-        key: Key of what they must have been found from; None for any.
 
     Returns:
-        The corrections; None if there are none, or none of that key.
+        The corrections; None if there are none.
 
     Raises:
         AssetFormatError: The file is damaged.
@@ -96,6 +95,4 @@ def read_mask_corrections(folder: Path, key: str | None = None) -> MaskCorrectio
     path = folder / FILE_NAME
     if not path.is_file():
         return None
-    content = read_json(path, "corrections of masks", MOST_BYTES)
-    found = MaskCorrections.from_dict(content, path)
-    return found if key is None or content.get("key") == key else None
+    return MaskCorrections.from_dict(read_json(path, "corrections of masks", MOST_BYTES), path)

@@ -51,8 +51,6 @@ def test_files_come_back_and_damage_is_named(tmp_path):
     path = tmp_path / FILE_NAME
     path.write_text(json.dumps({"key": "k", **FOUND.as_dict()}))
     assert read_exposures(tmp_path) == FOUND
-    assert read_exposures(tmp_path, "k") == FOUND
-    assert read_exposures(tmp_path, "other") is None
     wrong_gain = FOUND.as_dict() | {"cameras": [{"camera": "a", "gains": [0.0, 1.0, 1.0]}]}
     for content in ("[]", '{"cameras": 3}', '{"cameras": []}', json.dumps(wrong_gain)):
         path.write_text(content)

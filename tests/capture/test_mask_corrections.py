@@ -37,8 +37,6 @@ def test_files_come_back_and_damage_is_named(tmp_path):
     path = tmp_path / FILE_NAME
     path.write_text(json.dumps({"key": "k", **FOUND.as_dict()}))
     assert read_mask_corrections(tmp_path) == FOUND
-    assert read_mask_corrections(tmp_path, "k") == FOUND
-    assert read_mask_corrections(tmp_path, "other") is None
     for content in ("[]", '{"cameras": 3}', '{"cameras": {"a": {"pixels": 1e9, "error": 0}}}', '{"cameras": {"a": 1}}'):
         path.write_text(content)
         with pytest.raises(AssetFormatError, match="corrections of masks must be as beam reconstruct wrote them"):
