@@ -39,7 +39,7 @@ def cluster_at(words: str) -> Crew:
     if words not in ("ray",) and (not words.startswith("ray://") or len(words) == len("ray://")):
         raise InvalidOptionError(f"workers must name a cluster as ray://HOST:PORT, got {words}. Add its address.")
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MissingPackageError(
             "workers of a cluster must be reached by Ray, got no such package. Install it: pip install "
