@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
-from base64 import b64decode, b64encode
+from base64 import b64decode
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from engines.probes import Golden, Maps, prefiltered, shadow_maps
 from numpy.typing import NDArray
-from web.viewers import CHROMIUM, chromium
+from web.viewers import CHROMIUM, HERE, chromium
 
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.uploaded import ROWS
@@ -61,10 +61,9 @@ void main()
     made = item < count ? PROGRAM(item) : vec4(0.0);
 }
 """
-PAGE = """([source, given, count, width]) => {
+PAGE = """([source, width]) => {
   const gl = document.createElement("canvas").getContext("webgl2");
   if (!gl || !gl.getExtension("EXT_color_buffer_float")) throw new Error("no WebGL2 with float targets");
-  const floats = new Float32Array(Uint8Array.from(atob(given), each => each.charCodeAt(0)).buffer);
   const program = gl.createProgram();
   const corner = "vec2(gl_VertexID % 2, gl_VertexID / 2) * 4.0 - 1.0";
   const vertex = `#version 300 es\\nvoid main() { gl_Position = vec4(${corner}, 0.0, 1.0); }`;
@@ -77,28 +76,34 @@ PAGE = """([source, given, count, width]) => {
   }
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-  const texture = (rows, values) => {
+  gl.useProgram(program);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
+  const texture = (rows) => {
     const made = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, made);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, width, rows);
-    if (values) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, rows, gl.RGBA, gl.FLOAT, values);
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+      gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
     return made;
   };
-  const rows = Math.ceil(count / width);
-  const target = texture(rows, null);
-  gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
-  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
-  texture(floats.length / 4 / width, floats);
-  gl.useProgram(program);
-  gl.uniform1i(gl.getUniformLocation(program, "count"), count);
-  gl.viewport(0, 0, width, rows);
-  gl.drawArrays(gl.TRIANGLES, 0, 3);
-  const out = new Float32Array(4 * width * rows);
-  gl.readPixels(0, 0, width, rows, gl.RGBA, gl.FLOAT, out);
-  const bytes = new Uint8Array(out.buffer);
-  let text = "";
-  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
-  return btoa(text);
+  window.run = async (count) => {
+    const floats = new Float32Array(await (await fetch("/given")).arrayBuffer());
+    const rows = Math.ceil(count / width);
+    const target = texture(rows);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
+    const given = texture(floats.length / 4 / width);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, floats.length / 4 / width, gl.RGBA, gl.FLOAT, floats);
+    gl.uniform1i(gl.getUniformLocation(program, "count"), count);
+    gl.viewport(0, 0, width, rows);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    const out = new Float32Array(4 * width * rows);
+    gl.readPixels(0, 0, width, rows, gl.RGBA, gl.FLOAT, out);
+    for (const each of [target, given]) gl.deleteTexture(each);
+    const bytes = new Uint8Array(out.buffer);
+    let text = "";
+    for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+    return btoa(text);
+  };
 }"""
 
 
@@ -193,15 +198,16 @@ def program(target: str, function: str, folder: Path) -> Iterator[Program]:
     if target != "glsl":
         yield vulkan_program(target, function, folder)
         return
-    code = source(target, function)
     with chromium() as browser:
-        page = browser.new_page()
+        page, rows = browser.new_page(), [b""]
+        page.route("**/given", lambda route: route.fulfill(body=rows[0]))
+        page.route("**/page", lambda route: route.fulfill(body="", content_type="text/html"))
+        page.goto(f"{HERE}page")
+        page.evaluate(PAGE, [source(target, function), TEXTURE_WIDTH])
 
         def run_on(given: FloatArray, count: int) -> FloatArray:
-            rows = -(-len(given) // TEXTURE_WIDTH)
-            filled = np.zeros((rows * TEXTURE_WIDTH, 4), np.float32)
-            filled[: len(given)] = given
-            text = page.evaluate(PAGE, [code, b64encode(filled.tobytes()).decode(), count, TEXTURE_WIDTH])
+            rows[0] = np.pad(given, ((0, -len(given) % TEXTURE_WIDTH), (0, 0))).tobytes()
+            text = page.evaluate("run", count)
             return np.frombuffer(b64decode(text), np.float32).reshape(-1, 4)[:count]
 
         yield Program(target, run_on)
