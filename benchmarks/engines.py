@@ -3,8 +3,8 @@
     python benchmarks/engines.py --out result.json [--picture docs/images/engine_probes.png]
 
 Probes and lights are those of ``tests/engines/probes.py``. The generated texts are run as they are committed: WGSL and
-HLSL on Vulkan, GLSL ES 3.00 in a headless browser, on the processor where there is no GPU. Each shades the G-buffer that
-our rasteriser drew, so that what differs is arithmetic. A target whose tools are absent is left out, and named.
+HLSL on Vulkan, GLSL ES 3.00 in a headless browser, on the processor where there is no GPU. Each shades the G-buffer
+that our rasteriser drew, so that what differs is arithmetic. A target whose tools are absent is left out, and named.
 """
 
 from __future__ import annotations
