@@ -1,6 +1,6 @@
 """Pictures by the shading source of engines against the deferred renderer, in every language and on every probe.
 
-    python benchmarks/engines.py --out result.json [--picture docs/images/engine_probes.png]
+    python benchmarks/engine_shading.py --out result.json [--picture docs/images/engine_probes.png]
 
 Probes and lights are those of ``tests/engines/probes.py``. The generated texts are run as they are committed: WGSL and
 HLSL on Vulkan, GLSL ES 3.00 in a headless browser, on the processor where there is no GPU. Each shades the G-buffer
