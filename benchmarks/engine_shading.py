@@ -29,7 +29,7 @@ from beam_warp.image.tone import display_over
 
 TARGETS = ("wgsl", "hlsl", "glsl")
 BEHIND = (0.25, 0.25, 0.25)
-COLORS = 128
+COLORS = 255
 """Colours of the picture's palette."""
 
 
