@@ -51,7 +51,7 @@ def main() -> int:
             continue
         with tempfile.TemporaryDirectory() as folder, program(target, "shadedPixel", Path(folder)) as made:
             for row, case in zip(rows, cases, strict=True):
-                row["psnr"][target] = psnr(made.run(packed(case), SIDE * SIDE), case)
+                row["psnr"][target] = psnr(made(packed(case), SIDE * SIDE), case)
                 print(f"{target} {row['name']}: {row['psnr'][target]:.1f} dB", flush=True)
     record.write_result(args, wp.get_device("cpu"), {"side": SIDE, "absent": absent, "rows": rows})
     if args.picture:
