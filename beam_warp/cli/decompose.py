@@ -62,7 +62,11 @@ class Measuring:
         SECOND_PAGE,
     ] = None
     samples: Annotated[
-        int | None, arg(metavar="N", help="Rays per Gaussian for visibility, and as many for light; 64 by default.")
+        int | None,
+        arg(
+            metavar="N",
+            help="Rays per Gaussian for visibility; light takes more or fewer, as it is noisy. 64 by default.",
+        ),
     ] = None
     offset: Annotated[
         float | Literal["auto"] | None,
