@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ TARGETS = (0.025, 0.05, 0.1, 0.2)
 OCCLUSION_TARGETS = (0.01, 0.02, 0.04)
 REPEATS = 5
 
-Errors = dict[int, NDArray[np.floating[Any]]]
+Errors = Mapping[int, NDArray[np.floating[Any]]]
 """Errors of Gaussians by rays for each."""
 
 

@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tables import Row, Rows, figure, number, slug, step, table
 
 from beam_warp.study.picture import write_image
@@ -42,24 +43,31 @@ def economy_light(result: Row) -> Rows:
         ["", "rays", "error", "the same for each", "mean error", "stopped by itself", "faster", "base colour"]
     ]
     for name, found in result["captures"].items():
-        light = found["light"]
-        alone = {row["name"]: row for row in light["stopped"]}
-        for row in light["rows"]:
-            if "scores" in row:
-                label = row["name"].replace("target ", "light_error ")
-                own = alone.get(row["name"])
-                rows.append(
-                    [
-                        f"{name}, {label}",
-                        f"{row['rays']:.0f}",
-                        f"{100 * row['rmse']:.1f} %",
-                        f"{row.get('equal_rays', row['rays']):.0f}",
-                        f"{row['mean_in_standard_errors']:+.1f}",
-                        f"{own['mean_in_standard_errors']:+.1f}" if own else "",
-                        f"{row.get('faster', 1.0):.2f} ×",
-                        f"{row['scores']['base_color']:.2f} dB",
-                    ]
-                )
+        same, *others = (row for row in found["light"]["rows"] if "scores" in row)
+        words = [f"{name}, {same['name']}", f"{same['rays']}", f"{100 * same['rmse']:.1f} %", ""]
+        rows.append(
+            [*words, f"{same['mean_in_standard_errors']:+.1f}", "", "", f"{same['scores']['base_color']:.2f} dB"]
+        )
+        errors = [math.log(row["rmse"]) for row in others]
+        rays, faster = (
+            float(np.interp(math.log(same["rmse"]), errors, [row[key] for row in others])) for key in ("rays", "faster")
+        )
+        rows.append(
+            [f"{name}, at that error", f"{rays:.0f}", words[2], f"{same['rays']}", "", "", f"{faster:.2f} ×", ""]
+        )
+        for row, alone in zip(others, found["light"]["stopped"], strict=True):
+            rows.append(
+                [
+                    f"{name}, {row['name'].replace('target', 'light_error')}",
+                    f"{row['rays']:.0f}",
+                    f"{100 * row['rmse']:.1f} %",
+                    f"{row['equal_rays']:.0f}",
+                    f"{row['mean_in_standard_errors']:+.1f}",
+                    f"{alone['mean_in_standard_errors']:+.1f}",
+                    f"{row['faster']:.2f} ×",
+                    f"{row['scores']['base_color']:.2f} dB",
+                ]
+            )
     return rows
 
 
