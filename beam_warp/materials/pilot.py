@@ -23,9 +23,9 @@ RATE = 0.75
 root of n meet the edge, and each of these has a variance of 1/n^2 (He and Wang 2015)."""
 
 SHARE = 2.0 / (1.0 + 2.0 * RATE)
-"""Of all ways to spend as many rays, n in proportion to the error to this power leaves the least squares: an error s at
-one ray leaves s^2 n^(-2 RATE), and one more ray must lower each point's square as much as any other's (Neyman 1934, for
-RATE = 1/2)."""
+"""Numbers of rays in proportion to the error to this power leave the least squares of all that cost as much: an error s
+at one ray leaves s^2 n^(-2 RATE), and one more ray must lower each point's square as much as any other's (Neyman 1934,
+for RATE = 1/2)."""
 
 
 def rays_needed(
