@@ -206,11 +206,11 @@ class LitPoints:
     """Points whose light is known; all arrays are on the device and by row.
 
     Attributes:
-        light: The light at each point; filled batch by batch while `batches` are gone through.
+        light: The light at each point; filled batch by batch by `light_batches`.
         surface: Their normals and roughness.
         views: What views show of them.
         rows: Which Gaussians they are, ``(M,)``.
-        rays: How many rays went towards the light, ``(M,)``; filled when `batches` begin.
+        rays: How many rays go towards the light, ``(M,)``; filled when `light_batches` begins.
     """
 
     light: GatheredLight

@@ -51,7 +51,7 @@ def rays_needed(
     others = (sums[high] - sums[low] - squares) / np.maximum(high - low - 1, 1)
     expected = np.where(high - low > 1, np.sqrt(np.maximum(others, 0.0)), np.inf) * (first / count) ** RATE
     doublings = np.rint(np.log2(np.maximum(count / first * (expected / target) ** SHARE, 1.0)))
-    return (first * 2 ** np.minimum(doublings, np.log2(most // first))).astype(np.int32)
+    return (first * 2 ** np.minimum(doublings, np.floor(np.log2(most / first)))).astype(np.int32)
 
 
 def economy(error: NDArray[np.floating[Any]], rays: NDArray[np.integer[Any]], most: int) -> dict[str, Any]:

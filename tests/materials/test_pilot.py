@@ -53,6 +53,9 @@ class TestHowMany:
             errors = np.full(40, factor * at_first)
             assert (rays_needed(errors, 16, 256, count=64, target=0.05) == expected).all()
 
+    def test_sets_double_also_where_the_most_is_no_power_of_two(self):
+        assert (rays_needed(np.ones(40), 4, 20, count=5, target=0.05) == 16).all()
+
     def test_its_own_error_does_not_count(self, rng):
         errors = rng.uniform(0.0, 0.1, 60)
         before = rays_needed(errors, 16, 256, count=64, target=0.05)
