@@ -58,7 +58,7 @@ def main() -> int:
         panels = [
             (f"{c.probe}, {c.lighting}", display_over(c.image.rgb, c.image.alpha, background=BEHIND)) for c in cases
         ]
-        sheet = Image.fromarray(lay_out(panels, columns=6)).quantize(COLORS, dither=Image.Dither.NONE)
+        sheet = Image.fromarray(lay_out(panels, columns=6)).quantize(COLORS, Image.Quantize.MAXCOVERAGE)
         sheet.save(args.picture, optimize=True)
     return 0
 
