@@ -22,9 +22,9 @@ REACH = float(np.sqrt(-2.0 * np.log(ALPHA_MIN)))
 """Half the side of a disc's square, in standard deviations: outside, alpha is below `ALPHA_MIN`."""
 
 OFFSET, CENTER = "gaussian_offset", "gaussian_center"
-LAYER = (4.0, 1.0)
-"""A disc is passed by rays that start this near to its centre, and to its plane, in its largest standard deviations: discs
-of one surface overlap, and would shadow each other."""
+LAYER = 2.0 * REACH
+"""A disc is passed from behind by rays that start this near to its centre, in its largest standard deviations: discs of
+one surface overlap, and rays that leave it would end at its own."""
 
 
 def fill(mesh: bpy.types.Mesh, arrays: dict[str, np.ndarray]) -> None:
@@ -113,20 +113,19 @@ def disc_material() -> bpy.types.Material:
 
     geometry, path = tree.nodes.new("ShaderNodeNewGeometry"), tree.nodes.new("ShaderNodeLightPath")
     towards = geometry.outputs["Incoming"]
-    length = path.outputs["Ray Length"]
-    back = vector("SCALE", "Vector", v0=towards, v3=length)
+    normal = changed("NORMAL", attribute("shading_normal", "Vector"))
+    back = vector("SCALE", "Vector", v0=towards, v3=path.outputs["Ray Length"])
     start = vector("ADD", "Vector", v0=geometry.outputs["Position"], v1=back)
     center = changed("POINT", attribute(CENTER, "Vector"))
     size = _linked(tree, "ShaderNodeSeparateXYZ", {0: attribute("scale", "Vector")})
     size = math("MAXIMUM", size.outputs["X"], size.outputs["Y"])
-    far = math("GREATER_THAN", vector("DISTANCE", "Value", v0=start, v1=center), math("MULTIPLY", size, LAYER[0]))
-    height = math("ABSOLUTE", vector("DOT_PRODUCT", "Value", v0=back, v1=geometry.outputs["True Normal"]))
-    high = math("GREATER_THAN", height, math("MULTIPLY", size, LAYER[1]))
-    meets = math("MAXIMUM", math("MAXIMUM", far, high), path.outputs["Is Camera Ray"])
+    far = math("GREATER_THAN", vector("DISTANCE", "Value", v0=start, v1=center), math("MULTIPLY", size, LAYER))
+    cosine = vector("DOT_PRODUCT", "Value", v0=towards, v1=normal)
+    from_front = math("GREATER_THAN", cosine, 0.0)
+    meets = math("MAXIMUM", math("MAXIMUM", far, from_front), path.outputs["Is Camera Ray"])
     alpha = math("MULTIPLY", alpha, meets)
 
-    normal = changed("NORMAL", attribute("shading_normal", "Vector"))
-    away = math("LESS_THAN", vector("DOT_PRODUCT", "Value", v0=towards, v1=normal), -0.2)
+    away = math("LESS_THAN", cosine, -0.2)
     facing = _linked(tree, "ShaderNodeMath", {0: away, 1: -2.0, 2: 1.0}, operation="MULTIPLY_ADD").outputs[0]
     normal = vector("SCALE", "Vector", v0=normal, v3=facing)
     principled = _linked(

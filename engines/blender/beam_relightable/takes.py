@@ -31,6 +31,10 @@ MAX_HEADER_BYTES = 2**16
 DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "f": (0, 1, 0), "b": (0, -1, 0), "u": (0, 0, 1), "d": (0, 0, -1)}
 
 
+FLATTEST = 1e-3
+"""Least deviation of a Gaussian along an axis, in its largest one: flat ones have 0, and no inverse."""
+
+
 class TakeError(ValueError):
     """A file is no take that can be lit; the text says why, and what to do."""
 
@@ -158,23 +162,44 @@ def blended(first: decoder.Arrays, second: decoder.Arrays, part: float) -> decod
 
 
 def in_blender(arrays: decoder.Arrays, axes: str, scale: float) -> decoder.Arrays:
-    """Return arrays ``(N, C)`` in Blender's axes and metres, each Gaussian's thinnest axis its third one.
+    """Return arrays ``(N, C)`` in Blender's axes and metres, and Gaussians as discs.
 
     A mirror image M of a Gaussian is the one of the rotation -M, for Gaussians are symmetric about their centres.
     """
     matrix = _turn_of(axes)
-    turn = _quaternion(matrix * np.linalg.det(matrix))
-    thinnest = np.argmin(arrays["scales"], axis=0)
-    half = np.float32(0.5)
-    relabel = np.array([[half, half, half, half], [-half, -half, -half, half], [0, 0, 0, 1]], np.float32).T[:, thinnest]
-    order = (thinnest + np.arange(1, 4)[:, None]) % 3
-    result = dict(arrays)
-    result["positions"] = matrix @ arrays["positions"] * scale
-    result["normals"] = matrix @ arrays["normals"]
-    result["scales"] = np.take_along_axis(arrays["scales"], order, axis=0) * scale
-    turned = decoder.product(np.broadcast_to(turn[:, None], arrays["orientations"].shape), arrays["orientations"])
-    result["orientations"] = decoder.product(turned, relabel)
+    turn = _quaternion(matrix * np.linalg.det(matrix))[:, None]
+    result = arrays | {name: matrix @ arrays[name] for name in ("positions", "normals")}
+    turned = decoder.product(np.broadcast_to(turn, arrays["orientations"].shape), arrays["orientations"])
+    result["orientations"], result["scales"] = seen_along(result["normals"], turned, arrays["scales"])
+    for name in ("positions", "scales"):
+        result[name] = result[name] * scale
     return {name: np.ascontiguousarray(values.T, np.float32) for name, values in result.items()}
+
+
+def seen_along(normals: np.ndarray, turns: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return orientations and scales, planar, of the discs on which rays along the normals meet Gaussians at their peak.
+
+    That is the slice across P n, P being the inverse covariance: a flat Gaussian keeps its plane and a rod its length,
+    and a round one faces the way that its surface does. Who looks along a normal sees the Gaussian itself.
+    """
+    inverse = 1.0 / np.maximum(scales.astype(float), FLATTEST * np.maximum(scales.max(axis=0), 1e-12))
+    axes = [decoder.rotated(turns, np.eye(3)[:, k : k + 1]) for k in range(3)]
+    across = sum(each * (np.sum(each * normals, axis=0) * size**2) for each, size in zip(axes, inverse, strict=True))
+    x, y, z = across / np.maximum(np.sqrt(np.sum(across**2, axis=0)), 1e-30)
+    zero = np.zeros_like(x)
+    upright = np.stack([-y, x, zero, 1.0 + z])  # the shortest turn to it from the third axis; below, from its opposite
+    upright = np.where(z < 0.0, np.stack([1.0 - z, zero, x, -y]), upright)
+    upright = upright / np.sqrt(np.sum(upright**2, axis=0))
+    plane = [decoder.rotated(upright, np.eye(3)[:, k : k + 1]) for k in range(3)]
+    first, second, third = (
+        np.stack([np.sum(axis * each, axis=0) for axis in axes]) * inverse for each in plane
+    )  # dot products of one with another are entries of P
+    steep, flat, both = (np.sum(a * b, axis=0) for a, b in ((first, first), (second, second), (first, second)))
+    half = 0.5 * np.arctan2(2.0 * both, steep - flat)
+    mean, reach = 0.5 * (steep + flat), np.hypot(0.5 * (steep - flat), both)
+    about = np.stack([zero, zero, np.sin(0.5 * half), np.cos(0.5 * half)])
+    sizes = [1.0 / np.sqrt(square) for square in (mean + reach, mean - reach, np.sum(third**2, axis=0))]
+    return decoder.product(upright, about), np.stack(sizes)
 
 
 def _turn_of(axes: str) -> np.ndarray:
