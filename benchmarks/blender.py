@@ -24,11 +24,10 @@ import record
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "engines" / "blender")]
+sys.path[:0] = [str(ROOT / place) for place in ("tests", "tests/engines", "engines/blender")]
 
-from build import build  # noqa: E402
+import probes  # noqa: E402
 from delivery_take import take  # noqa: E402
-from engines import probes  # noqa: E402
 
 from beam_warp import converters  # noqa: E402
 from beam_warp.demo.figure import build_figure  # noqa: E402
@@ -42,6 +41,7 @@ from beam_warp.world.axes import change_axes  # noqa: E402
 from beam_warp.world.camera import Camera  # noqa: E402
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence  # noqa: E402
 from beam_warp.world.shot import Shot  # noqa: E402
+from build import build  # noqa: E402
 
 LIGHTS = ("studio", "sunset")
 BOUNCES = 4
@@ -110,9 +110,7 @@ def cases(names: list[str], effort: Effort, folder: Path) -> Iterator[Case]:
         camera = Camera.look_at(probes.EYES[name], target, **size)
         for light in LIGHTS:
             environment = probes.environment(light)
-            shot = Shot(
-                cloud=cloud, camera=camera, environment=environment, environment_rotation=probes.ROTATION
-            )
+            shot = Shot(cloud=cloud, camera=camera, environment=environment, environment_rotation=probes.ROTATION)
             yield Case(name, light, asset, shot)
 
 

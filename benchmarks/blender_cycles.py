@@ -39,7 +39,7 @@ def look(scene, camera):
 
 
 def cycles(scene, samples, bounces):
-    """Ask for what the path tracer computes: nothing clamped, filtered or denoised, the pixel's square as its filter."""
+    """Ask for what the path tracer computes: nothing clamped or denoised, the pixel's square as its filter."""
     scene.render.engine, scene.render.film_transparent = "CYCLES", True
     settings = scene.cycles
     settings.samples, settings.use_adaptive_sampling, settings.use_denoising = samples, False, False

@@ -23,16 +23,16 @@ struct BeamRelight
     float3 seenNormal(float3 rawNormal_0, float3 view_1)
     {
         float size_0 = length(rawNormal_0);
-        float3 _S21;
+        float3 _S23;
         if(size_0 > 9.999999960041972e-13f)
         {
-            _S21 = rawNormal_0 / size_0;
+            _S23 = rawNormal_0 / size_0;
         }
         else
         {
-            _S21 = view_1;
+            _S23 = view_1;
         }
-        return _S21;
+        return _S23;
     }
 
     float specularAlbedo(float2 albedoTerms_0)
@@ -44,16 +44,16 @@ struct BeamRelight
     {
         float3 normal_2 = seenNormal(surface_4.normal, surface_4.view);
         float away_1 = 0.00100000004749745f - dot(normal_2, surface_4.view);
-        float3 _S25;
+        float3 _S27;
         if(away_1 > 0.0f)
         {
-            _S25 = normalize(normal_2 + away_1 * surface_4.view);
+            _S27 = normalize(normal_2 + away_1 * surface_4.view);
         }
         else
         {
-            _S25 = normal_2;
+            _S27 = normal_2;
         }
-        return _S25;
+        return _S27;
     }
 
     float lightCosine(Surface surface_5)
@@ -67,8 +67,8 @@ struct BeamRelight
         float width_1 = 0.86602538824081421f * disc_1.sine * sqrt(max(1.0f - middle_0 * middle_0, 0.0f));
         if((abs(middle_0)) < width_1)
         {
-            float _S26 = middle_0 + width_1;
-            return _S26 * _S26 / (4.0f * width_1);
+            float _S28 = middle_0 + width_1;
+            return _S28 * _S28 / (4.0f * width_1);
         }
         return max(middle_0, 0.0f);
     }
@@ -77,16 +77,16 @@ struct BeamRelight
     {
         float nDotV_1 = dot(normal_4, view_2);
         float nDotL_0 = dot(normal_4, light_0);
-        bool _S27;
+        bool _S29;
         if(nDotV_1 > 0.0f)
         {
-            _S27 = nDotL_0 > 0.0f;
+            _S29 = nDotL_0 > 0.0f;
         }
         else
         {
-            _S27 = false;
+            _S29 = false;
         }
-        if(!_S27)
+        if(!_S29)
         {
             return 0.0f;
         }
@@ -94,18 +94,18 @@ struct BeamRelight
         float nDotH_0 = dot(normal_4, middle_1);
         float a2_0 = alpha_1 * alpha_1;
         float d_2 = nDotH_0 * nDotH_0 * (a2_0 - 1.0f) + 1.0f;
-        float _S28 = 1.0f - a2_0;
+        float _S30 = 1.0f - a2_0;
         float m_0 = clamp(1.0f - dot(view_2, middle_1), 0.0f, 1.0f);
-        return a2_0 / (3.14159274101257324f * d_2 * d_2) * (0.5f / max(nDotV_1 * sqrt(nDotL_0 * nDotL_0 * _S28 + a2_0) + nDotL_0 * sqrt(nDotV_1 * nDotV_1 * _S28 + a2_0), 9.999999960041972e-13f)) * (0.03999999910593033f + 0.95999997854232788f * m_0 * m_0 * m_0 * m_0 * m_0);
+        return a2_0 / (3.14159274101257324f * d_2 * d_2) * (0.5f / max(nDotV_1 * sqrt(nDotL_0 * nDotL_0 * _S30 + a2_0) + nDotL_0 * sqrt(nDotV_1 * nDotV_1 * _S30 + a2_0), 9.999999960041972e-13f)) * (0.03999999910593033f + 0.95999997854232788f * m_0 * m_0 * m_0 * m_0 * m_0);
     }
 
     float3 lightRadiance(Surface surface_6, LightDisc disc_2, float2 albedoTerms_2)
     {
         float3 normal_5 = lightNormal(surface_6);
         float widening_0 = 0.5f * disc_2.sine;
-        float _S29 = surface_6.roughness;
-        float _S30 = max(_S29 * _S29, 0.00100000004749745f);
-        return (surface_6.baseColor * ((1.0f - specularAlbedo(albedoTerms_2)) / 3.14159274101257324f * discCosine(disc_2, normal_5)) + specularBrdf(normal_5, surface_6.view, disc_2.direction, max(sqrt(_S30 * _S30 + widening_0 * widening_0), 0.00100000004749745f)) * max(dot(normal_5, disc_2.direction), 0.0f)) * disc_2.irradiance;
+        float _S31 = surface_6.roughness;
+        float _S32 = max(_S31 * _S31, 0.00100000004749745f);
+        return (surface_6.baseColor * ((1.0f - specularAlbedo(albedoTerms_2)) / 3.14159274101257324f * discCosine(disc_2, normal_5)) + specularBrdf(normal_5, surface_6.view, disc_2.direction, max(sqrt(_S32 * _S32 + widening_0 * widening_0), 0.00100000004749745f)) * max(dot(normal_5, disc_2.direction), 0.0f)) * disc_2.irradiance;
     }
 };
 

@@ -1,4 +1,4 @@
-"""Blender add-on: relightable 4D Gaussians of a delivery container (b4d) or a PLY, as discs that Cycles and EEVEE light.
+"""Blender add-on: relightable 4D Gaussians of a container (b4d) or a PLY, as discs that Cycles and EEVEE light.
 
 An object keeps the path of its take, not its frames: a handler puts the Gaussians of the scene's time into its mesh.
 """
@@ -85,7 +85,7 @@ class IMPORT_SCENE_OT_relightable(bpy.types.Operator, ImportHelper):
 
     bl_idname = "import_scene.relightable"
     bl_label = "Import Relightable Gaussians"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012  Blender wants a set
 
     filter_glob: StringProperty(default="*.b4d;*.ply;manifest.json", options={"HIDDEN"})
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"})

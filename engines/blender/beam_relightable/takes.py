@@ -177,7 +177,7 @@ def in_blender(arrays: decoder.Arrays, axes: str, scale: float) -> decoder.Array
 
 
 def seen_along(normals: np.ndarray, turns: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return orientations and scales, planar, of the discs on which rays along the normals meet Gaussians at their peak.
+    """Return orientations and scales of the discs on which rays along the normals meet Gaussians at their peak.
 
     That is the slice across P n, P being the inverse covariance: a flat Gaussian keeps its plane and a rod its length,
     and a round one faces the way that its surface does. Who looks along a normal sees the Gaussian itself.

@@ -13,7 +13,6 @@ from support.moving_cloud import clouds, written
 
 from beam_warp import converters
 from beam_warp._version import __version__
-from beam_warp.converters import WriteOptions
 from beam_warp.world.axes import AXIS_CODES, change_axes
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -57,7 +56,9 @@ class TestPly:
 
     def test_units_are_those_of_the_file(self, takes, tmp_path):
         path = written(tmp_path / "a.ply", 1, profile="beam")
-        path.write_bytes(path.read_bytes().replace(b"comment beam_schema", b"comment beam_meters_per_unit 0.01\ncomment x"))
+        path.write_bytes(
+            path.read_bytes().replace(b"comment beam_schema", b"comment beam_meters_per_unit 0.01\ncomment x")
+        )
         assert np.allclose(takes.open_take(path).at(0.0)["positions"], 0.01 * next(clouds()).positions, atol=1e-6)
 
     def test_axes_that_are_not_stated_are_given(self, takes, tmp_path):
