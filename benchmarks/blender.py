@@ -28,6 +28,7 @@ sys.path[:0] = [str(ROOT / place) for place in ("tests", "tests/engines", "engin
 
 import probes  # noqa: E402
 from delivery_take import take  # noqa: E402
+from zip_addon import build  # noqa: E402
 
 from beam_warp import converters  # noqa: E402
 from beam_warp.demo.figure import build_figure  # noqa: E402
@@ -41,7 +42,6 @@ from beam_warp.world.axes import change_axes  # noqa: E402
 from beam_warp.world.camera import Camera  # noqa: E402
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence  # noqa: E402
 from beam_warp.world.shot import Shot  # noqa: E402
-from build import build  # noqa: E402
 
 LIGHTS = ("studio", "sunset")
 BOUNCES = 4

@@ -16,7 +16,7 @@ def addon(tmp_path_factory):
     folder = tmp_path_factory.mktemp("extensions")
     sys.path.insert(0, str(ENGINE))
     try:
-        importlib.import_module("build").build(folder / "addon.zip")
+        importlib.import_module("zip_addon").build(folder / "addon.zip")
     finally:
         sys.path.remove(str(ENGINE))
     zipfile.ZipFile(folder / "addon.zip").extractall(folder / "beam_relightable")

@@ -1,4 +1,4 @@
-"""What `test_addon.py` runs in Blender: ``python inside_blender.py JOB.json``. It writes arrays and facts beside the job.
+"""What `test_addon.py` runs in Blender: ``python inside_blender.py JOB.json`` writes arrays and facts beside the job.
 
 The add-on is installed from its zip, as a user does it.
 """

@@ -1,4 +1,4 @@
-"""Zip the add-on with its decoder: ``python engines/blender/build.py beam_relightable.zip``, then install from disk."""
+"""Zip the add-on with its decoder: ``python engines/blender/zip_addon.py beam_relightable.zip``, then install from disk."""
 
 import sys
 import zipfile
@@ -18,5 +18,5 @@ def build(target: Path) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("target must be one path, got none. Run python engines/blender/build.py beam_relightable.zip.")
+        sys.exit("target must be one path, got none. Run python engines/blender/zip_addon.py beam_relightable.zip.")
     build(Path(sys.argv[1]))
