@@ -52,7 +52,7 @@ FIGURE_GAUSSIANS = 30_000
 class Effort:
     """How much is measured: side of a square picture [pixel], samples of a pixel, Gaussians of the figure."""
 
-    side: int = 72
+    side: int = 64
     samples: int = 256
     cycles_samples: int = 128
     figure: int = FIGURE_GAUSSIANS
@@ -162,7 +162,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="small pictures of few samples")
     parser.add_argument("--probes", nargs="+", choices=list(probes.PROBES), default=list(probes.PROBES))
     parser.add_argument("--picture", type=Path, metavar="JPG", help="the last probe, ours beside Cycles'")
-    parser.add_argument("--side", type=int, metavar="PX", help="side of pictures")
+    parser.add_argument("--side", type=int, metavar="PX", help=f"side of pictures, {FULL.side} by default")
     record.add_arguments(parser)
     arguments = parser.parse_args()
     python = os.environ.get("BEAM_BPY", "").split(os.pathsep)[0]

@@ -1,4 +1,4 @@
-"""Zip the add-on with its decoder: ``python engines/blender/zip_addon.py beam_relightable.zip``, then install from disk."""
+"""Zip the add-on with its decoder: ``python engines/blender/zip_addon.py beam_relightable.zip``; install it from disk."""
 
 import sys
 import zipfile

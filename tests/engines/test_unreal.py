@@ -15,7 +15,7 @@ UNREAL = Path(__file__).parents[2] / "engines" / "unreal"
 PASTED = (UNREAL / "RelightLamp.hlsl").read_text(encoding="utf-8")
 INPUTS = "float3 BaseColor, float Roughness, float3 Normal, float3 View, float3 LightDirection, float3 LightIrradiance"
 
-# A Custom node is a function's body. Glslang takes calls of a struct that is defined in one for recursion: it is outside.
+# A Custom node is a function's body. Glslang takes calls of a struct of its own for recursion: it stands outside.
 NODE = """
 [[vk::binding(0, 0)]] StructuredBuffer<float4> given;
 [[vk::binding(1, 0)]] RWStructuredBuffer<float4> made;

@@ -86,7 +86,8 @@ def disc_nodes(material: bpy.types.Material) -> bpy.types.NodeTree:
 def disc_material() -> bpy.types.Material:
     """Return the material: a dielectric with the colour, roughness and normal of each Gaussian, faded to its edge."""
     material = bpy.data.materials.new("Relightable Gaussians")
-    material.use_nodes = True
+    if material.node_tree is None:  # from Blender 5 on, there is always one
+        material.use_nodes = True
     material.surface_render_method = "DITHERED"
     material.cycles.use_bump_map_correction = False  # normals are of the surface, not of its bumps
     tree = material.node_tree
@@ -102,8 +103,8 @@ def disc_material() -> bpy.types.Material:
         numbered = {int(name[1:]): value for name, value in inputs.items()}
         return _linked(tree, "ShaderNodeVectorMath", numbered, operation=operation).outputs[output]
 
-    def changed(kind: str, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        way = {"vector_type": kind, "convert_from": "OBJECT", "convert_to": "WORLD"}
+    def changed(kind: str, first: str, last: str, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        way = {"vector_type": kind, "convert_from": first, "convert_to": last}
         return _linked(tree, "ShaderNodeVectorTransform", {"Vector": value}, **way).outputs[0]
 
     offset = attribute(OFFSET, "Vector")
@@ -113,10 +114,10 @@ def disc_material() -> bpy.types.Material:
 
     geometry, path = tree.nodes.new("ShaderNodeNewGeometry"), tree.nodes.new("ShaderNodeLightPath")
     towards = geometry.outputs["Incoming"]
-    normal = changed("NORMAL", attribute("shading_normal", "Vector"))
+    normal = changed("NORMAL", "OBJECT", "WORLD", attribute("shading_normal", "Vector"))
     back = vector("SCALE", "Vector", v0=towards, v3=path.outputs["Ray Length"])
     start = vector("ADD", "Vector", v0=geometry.outputs["Position"], v1=back)
-    center = changed("POINT", attribute(CENTER, "Vector"))
+    start, center = changed("POINT", "WORLD", "OBJECT", start), attribute(CENTER, "Vector")
     size = _linked(tree, "ShaderNodeSeparateXYZ", {0: attribute("scale", "Vector")})
     size = math("MAXIMUM", size.outputs["X"], size.outputs["Y"])
     far = math("GREATER_THAN", vector("DISTANCE", "Value", v0=start, v1=center), math("MULTIPLY", size, LAYER))
