@@ -1,4 +1,4 @@
-"""Zip the add-on with its decoder: ``python engines/blender/zip_addon.py beam_relightable.zip``; install it from disk."""
+"""Zip the add-on with its decoder, to be installed from disk: ``python engines/blender/zip_addon.py TARGET.zip``."""
 
 import sys
 import zipfile
