@@ -1,0 +1,46 @@
+using System;
+using System.Collections.Generic;
+using System.IO;
+using Beam.Relightable;
+
+/// <summary>Writes what the parser reads: Dump take folder writes blocks, Dump take prints the first error.</summary>
+public static class Dump {
+    public static int Main(string[] arguments) {
+        try {
+            var take = new Container(arguments[0]);
+            Write(take.Still, "static", arguments[1]);
+            foreach (BlockEntry entry in take.Segments) {
+                Block block = take.Read(entry);
+                Write(block, Path.GetFileNameWithoutExtension(entry.File), arguments[1]);
+                for (int frame = 0; frame < entry.Frames; frame++) {
+                    foreach (KeyValuePair<string, float[]> pair in take.Frame(block, frame))
+                        WriteFloats(pair.Value, Path.Combine(arguments[1], (entry.First + frame) + "." + pair.Key));
+                }
+            }
+            Console.WriteLine(take.Frames + " " + take.Count + " " + take.Rate + " " + take.IsConstant);
+            return 0;
+        } catch (DeliveryException error) {
+            Console.WriteLine(error.Message);
+            return 2;
+        }
+    }
+
+    private static void Write(Block block, string name, string folder) {
+        foreach (KeyValuePair<string, Component[]> pair in block.Arrays) {
+            for (int c = 0; c < pair.Value.Length; c++) {
+                string path = Path.Combine(folder, name + "." + pair.Key + c);
+                WriteFloats(pair.Value[c].Weights, path + ".weights");
+                var numbers = new List<float>();
+                foreach (Plane plane in pair.Value[c].Planes)
+                    for (int i = 0; i < block.Count; i++) numbers.Add(block.At(plane, i));
+                WriteFloats(numbers.ToArray(), path + ".planes");
+            }
+        }
+    }
+
+    private static void WriteFloats(float[] values, string path) {
+        var content = new byte[4 * values.Length];
+        Buffer.BlockCopy(values, 0, content, 0, content.Length);
+        File.WriteAllBytes(path, content);
+    }
+}

@@ -1,0 +1,133 @@
+"""The package's parser, run by mono: planes and weights bit by bit, frames number by number, one line an error."""
+
+import re
+
+import numpy as np
+import pytest
+from engines.unity.csharp import HERE, PARSER, compiled, needs_mono, run
+from scipy.spatial.transform import Rotation
+from support.radiant_cloud import radiant_cloud
+
+from beam_warp import converters
+from beam_warp.converters import WriteOptions
+from beam_warp.converters.delivery.decoder import Container
+from beam_warp.world.gaussians import GaussianSequence
+
+pytestmark = needs_mono
+
+
+@pytest.fixture(scope="module")
+def dump(tmp_path_factory):
+    program = tmp_path_factory.mktemp("dump") / "dump.exe"
+    said = compiled([HERE / "Dump.cs", *PARSER], program)
+    assert not said, said
+    return program
+
+
+def walk(count, frames, *, noise, degree=None):
+    """A cloud that turns and shakes."""
+    rng = np.random.default_rng(count)
+    radiance = {} if degree is not None else {"radiance": None, "radiance_color_space": None}
+    cloud = radiant_cloud(count, degree or 0, materials=True, **radiance)
+    clouds = []
+    for frame in range(frames):
+        turn = Rotation.from_euler("z", 0.1 * frame) * Rotation.from_rotvec(noise * rng.normal(size=(count, 3)))
+        clouds.append(
+            cloud.with_arrays(
+                positions=turn.apply(cloud.positions) + 0.1 * frame,
+                orientations=(turn * Rotation.from_quat(cloud.orientations)).as_quat(),
+                normals=turn.apply(cloud.normals),
+                ambient_occlusion=np.clip(cloud.ambient_occlusion + noise * rng.normal(size=count), 0.0, 1.0),
+            )
+        )
+    return GaussianSequence.from_clouds(clouds, frames_per_second=24.0, metadata={"producer": "nobody"})
+
+
+TAKES = {
+    "moving": ("a.b4d", lambda: walk(60, 14, noise=0.02), WriteOptions()),
+    "folder": ("manifest.json", lambda: walk(17, 13, noise=0.0), WriteOptions()),
+    "still with radiance": ("a.b4d", lambda: walk(33, 1, noise=0.0, degree=1), WriteOptions(sh_degree=1)),
+}
+
+
+@pytest.mark.parametrize("name", TAKES)
+def test_the_parser_reads_what_python_reads(dump, tmp_path, name):
+    file, make, options = TAKES[name]
+    take = tmp_path / "take" / file
+    take.parent.mkdir()
+    converters.write(make(), take, options)
+    (tmp_path / "out").mkdir()
+    done = run(dump, take, tmp_path / "out")
+    assert done.returncode == 0, done.stdout + done.stderr
+    container = Container(take)
+    manifest = container.manifest
+    facts = [*(f"{manifest[key]:g}" for key in ("frames", "count", "rate")), str(manifest["topology"] == "constant")]
+    assert done.stdout.split() == facts
+    found = {path.name: np.fromfile(path, np.float32) for path in (tmp_path / "out").iterdir()}
+    for entry in (container.manifest["static"], *container.manifest["segments"]):
+        for array, track in container.tracks(entry, entry.get("frames", 1)).items():
+            for c, component in enumerate(track):
+                part = f"{entry['file'].removesuffix('.bin')}.{array}{c}"
+                planes = [*component.summed, *component.plain]
+                assert (found.pop(f"{part}.weights") == component.weights.ravel()).all(), part
+                theirs = found.pop(f"{part}.planes")
+                assert len(theirs) == sum(map(len, planes)), part
+                assert not planes or (theirs == np.concatenate(planes).astype(np.float32)).all(), part
+    for frame in range(container.manifest["frames"]):
+        for array, values in container.frame(frame).items():
+            theirs = found.pop(f"{frame}.{array}")
+            # sums of some twenty float32 products, here of doubles: 25 steps of 6e-8, of the largest number
+            np.testing.assert_allclose(theirs, values.ravel(), rtol=0, atol=1.5e-6 * max(1.0, np.abs(values).max()))
+    assert not found
+
+
+def damaged(take, place):
+    content = bytearray(take.read_bytes())
+    content[place(content)] ^= 1
+    take.write_bytes(content)
+
+
+def cut(take, size):
+    take.write_bytes(take.read_bytes()[: int(size * take.stat().st_size)])
+
+
+DAMAGES = {
+    "altered segment": (lambda take: damaged(take, lambda b: b.rindex(b"PK\3\4") + 60), "000012.bin must have the digest"),
+    "altered static block": (lambda take: damaged(take, lambda b: b.index(b"static.bin", b.index(b"}]}")) + 99), "static.bin"),
+    "truncated segment": (lambda take: cut(take, 0.8), r"0000\d\d.bin must have \d+ bytes, got \d+"),
+    "truncated manifest": (lambda take: cut(take, 0.01), "manifest.json must have at most"),
+    "no file": (lambda take: take.unlink(), "a container must be a file, got no a.b4d"),
+    "another file": (lambda take: take.write_bytes(b"splat" * 99), "a b4d file must be a zip archive that begins"),
+    "empty": (lambda take: take.write_bytes(b""), "a b4d file must be a zip archive that begins"),
+    "another version": (
+        lambda take: take.write_bytes(take.read_bytes().replace(b'"version":1', b'"version":2')),
+        "version must be 1 of b4d, got 2",
+    ),
+    "escaping name": (
+        lambda take: take.write_bytes(take.read_bytes().replace(b'"static.bin"', b'"/tatic.bin"')),
+        "blocks must say their file, a name beside the manifest, got /tatic.bin",
+    ),
+    "deep nesting": (
+        lambda take: take.write_bytes(re.sub(rb'\{"format.{400}', b"[" * 407 + b"", take.read_bytes(), count=1)),
+        "JSON must not be nested that deep",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    take = tmp_path_factory.mktemp("sound") / "a.b4d"
+    converters.write(walk(60, 14, noise=0.02), take, WriteOptions())
+    return take.read_bytes()
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_take_is_refused_in_one_line(dump, sound, tmp_path, name):
+    take = tmp_path / "a.b4d"
+    take.write_bytes(sound)
+    change, said = DAMAGES[name]
+    change(take)
+    done = run(dump, take, tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout.count("\n") == 1
+    assert re.match(said, done.stdout), done.stdout
