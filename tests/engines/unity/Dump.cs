@@ -3,11 +3,12 @@ using System.Collections.Generic;
 using System.IO;
 using Beam.Relightable;
 
-/// <summary>Writes what the parser reads: Dump take folder writes blocks, Dump take prints the first error.</summary>
+/// <summary>Dump TAKE FOLDER writes what the parser reads, or prints its error; Dump TAKE FOLDER FRAME what a GPU gets.</summary>
 public static class Dump {
     public static int Main(string[] arguments) {
         try {
             var take = new Container(arguments[0]);
+            if (arguments.Length == 3) return WriteMoment(take, double.Parse(arguments[2]), arguments[1]);
             Write(take.Still, "static", arguments[1]);
             foreach (BlockEntry entry in take.Segments) {
                 Block block = take.Read(entry);
@@ -23,6 +24,23 @@ public static class Dump {
             Console.WriteLine(error.Message);
             return 2;
         }
+    }
+
+    private static int WriteMoment(Container take, double time, string folder) {
+        int frame = (int)time, index = take.Segments.FindIndex(entry => frame < entry.First + entry.Frames);
+        BlockEntry held = take.Segments[index];
+        bool isLast = frame == held.First + held.Frames - 1 && index + 1 < take.Segments.Count;
+        Block segment = take.Read(held), next = isLast ? take.Read(take.Segments[index + 1]) : null;
+        var terms = new Terms();
+        terms.Set(take, segment, frame - held.First, next, (float)(time - frame));
+        File.WriteAllBytes(Path.Combine(folder, "still"), take.Still.Planes);
+        File.WriteAllBytes(Path.Combine(folder, "segment"), segment.Planes);
+        File.WriteAllBytes(Path.Combine(folder, "next"), next == null ? new byte[16] : next.Planes);
+        WriteFloats(terms.Ranges, Path.Combine(folder, "components"));
+        var rows = new byte[16 * terms.Count];
+        Buffer.BlockCopy(terms.Rows, 0, rows, 0, rows.Length);
+        File.WriteAllBytes(Path.Combine(folder, "terms"), rows);
+        return 0;
     }
 
     private static void Write(Block block, string name, string folder) {
