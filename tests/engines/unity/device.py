@@ -46,7 +46,7 @@ def compiled(file, entry, *defines):
         out = Path(folder) / "out.spv"
         command = [GLSLANG, "-D", "-V", "--target-env", TARGET, "--auto-map-bindings", "--auto-map-locations"]
         command += ["--hlsl-iomap", "--quiet", "-S", stage_of(entry), "-e", entry, *(f"-D{name}" for name in defines)]
-        command += [f"-I{SHADERS}", "--resource-set-binding", "frag", "1", "-o", str(out), str(SHADERS / file)]
+        command += [f"-I{SHADERS}", "--resource-set-binding", "1" if stage_of(entry) == "frag" else "0", "-o", str(out), str(SHADERS / file)]
         run = subprocess.run(command, capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stdout + run.stderr
         run = subprocess.run([SPIRV_VAL, "--target-env", TARGET, out], capture_output=True, text=True, check=False)
