@@ -46,7 +46,14 @@ def compiled(file, entry, *defines):
         out = Path(folder) / "out.spv"
         command = [GLSLANG, "-D", "-V", "--target-env", TARGET, "--auto-map-bindings", "--auto-map-locations"]
         command += ["--hlsl-iomap", "--quiet", "-S", stage_of(entry), "-e", entry, *(f"-D{name}" for name in defines)]
-        command += [f"-I{SHADERS}", "--resource-set-binding", "1" if stage_of(entry) == "frag" else "0", "-o", str(out), str(SHADERS / file)]
+        command += [
+            f"-I{SHADERS}",
+            "--resource-set-binding",
+            "1" if stage_of(entry) == "frag" else "0",
+            "-o",
+            str(out),
+            str(SHADERS / file),
+        ]
         run = subprocess.run(command, capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stdout + run.stderr
         run = subprocess.run([SPIRV_VAL, "--target-env", TARGET, out], capture_output=True, text=True, check=False)
@@ -86,7 +93,7 @@ class Device:
 
     def __init__(self):
         self.wgpu = __import__("wgpu")
-        self.device = adapter().request_device_sync(required_features=["float32-blendable"])
+        self.device = adapter().request_device_sync(required_features=["float32-blendable", "float32-filterable"])
         self.held = {}
         self.constants = {}
         self.pipelines = {}
@@ -109,12 +116,12 @@ class Device:
             (width, height, layers),
         )
 
-    def target(self, name, layers, height, width):
+    def target(self, name, layers, height, width, kind="rgba32float"):
         """Make a texture that can be drawn to and read, under a name."""
         use = self.wgpu.TextureUsage
         texture = self.device.create_texture(
             size=(width, height, layers),
-            format="rgba32float",
+            format=kind,
             usage=use.TEXTURE_BINDING | use.COPY_DST | use.COPY_SRC | use.RENDER_ATTACHMENT,
         )
         self.held[name] = texture
@@ -124,6 +131,7 @@ class Device:
         """Return a texture's layer, ``(height, width, 4)``."""
         texture = self.held[name]
         width, height, _ = texture.size
+        assert texture.format == "rgba32float"
         data = self.device.queue.read_texture(
             {"texture": texture, "origin": (0, 0, layer)}, {"bytes_per_row": 16 * width}, (width, height, 1)
         )
@@ -165,8 +173,8 @@ class Device:
             return self.device.create_sampler(mag_filter="linear", min_filter="linear", mipmap_filter="linear")
         held = self.held[name]
         if hasattr(held, "create_view"):
-            dimension = "2d" if name == "_CameraDepthTexture" else "2d-array"
-            return held.create_view(dimension=dimension)
+            dimensions = {"_CameraDepthTexture": "2d", "_BeamCube": "cube"}
+            return held.create_view(dimension=dimensions.get(name, "2d-array"))
         return {"buffer": held, "offset": 0, "size": held.size}
 
     def compute(self, file, entry, groups):
@@ -192,12 +200,13 @@ class Device:
         found = [compiled(file, entry, *defines) for entry in entries]
         vertex, fragment = (self.device.create_shader_module(code=each.code) for each in found)
         part = {"src_factor": "one", "dst_factor": "one-minus-src-alpha", "operation": "add"}
-        state = {"format": "rgba32float"} | ({"blend": {"color": part, "alpha": part}} if blended else {})
+        state = {"blend": {"color": part, "alpha": part}} if blended else {}
+        states = [state | {"format": self.held[name].format} for name in targets]
         pipeline = self.device.create_render_pipeline(
             layout="auto",
             vertex={"module": vertex, "entry_point": entries[0], "buffers": []},
             primitive={"topology": "triangle-list", "cull_mode": "none"},
-            fragment={"module": fragment, "entry_point": entries[1], "targets": [state] * len(targets)},
+            fragment={"module": fragment, "entry_point": entries[1], "targets": states},
         )
         encoder = self.device.create_command_encoder()
         attachments = [

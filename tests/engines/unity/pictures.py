@@ -6,14 +6,20 @@ from engines.probes import MAP_SIZE, prefiltered, shadow_maps
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.uploaded import upload_lights
 
-G_BUFFER = ("_BeamLook", "_BeamNormal", "_BeamRest")
+G_BUFFER = {
+    "_BeamLook": "rgba16float",
+    "_BeamNormal": "rgba16float",
+    "_BeamRest": "rgba32float",
+    "_BeamFirst": "rgba32float",
+}
+"""Targets of the G-buffer, and what the package keeps them in; its last one has one channel there."""
 
 
 def row(*values):
     return np.concatenate([np.ravel(value) for value in values]).astype(np.float32)
 
 
-def upload_gaussians(device, cloud):
+def upload_gaussians(device, cloud, to_world=None):
     rows = np.zeros((len(cloud), 5, 4), np.float32)
     rows[:, 0] = np.column_stack([cloud.positions, cloud.opacities])
     rows[:, 1] = cloud.orientations
@@ -21,7 +27,7 @@ def upload_gaussians(device, cloud):
     rows[:, 3] = np.column_stack([cloud.base_color, cloud.ambient_occlusion])
     rows[:, 4, :3] = cloud.normals
     device.buffer("_BeamGaussians", rows)
-    device.set(_BeamObject=np.eye(4))
+    device.set(_BeamObject=np.eye(4) if to_world is None else to_world)
 
 
 def sort(device, count, position, way):
@@ -63,16 +69,16 @@ def draw_buffer(device, cloud, camera, scene_depth=0.0):
     """Draw the G-buffer behind opaque surfaces whose depth is stored as that."""
     sort(device, len(cloud), camera.position, camera.forward)
     set_view(device, camera)
-    for name in G_BUFFER:
-        device.target(name, 1, camera.height, camera.width)
+    for name, kind in G_BUFFER.items():
+        device.target(name, 1, camera.height, camera.width, kind)
     device.texture("_CameraDepthTexture", np.full((1, camera.height, camera.width, 4), scene_depth))
-    device.draw("Splats.hlsl", ("SplatVertex", "SplatFragment"), G_BUFFER, 6 * len(cloud))
+    device.draw("Splats.hlsl", ("SplatVertex", "SplatFragment"), list(G_BUFFER), 6 * len(cloud))
 
 
 def draw_shadow_maps(device, cloud, maps):
     """Draw the shadow maps of all lamps."""
-    device.target("_BeamShadowSums", max(len(maps.views), 1), MAP_SIZE, MAP_SIZE)
-    device.target("_BeamShadowMeshes", max(len(maps.views), 1), MAP_SIZE, MAP_SIZE)
+    for name in ("_BeamShadowSums", "_BeamShadowFirst", "_BeamShadowMeshes"):
+        device.target(name, max(len(maps.views), 1), MAP_SIZE, MAP_SIZE)
     rows = [np.zeros(24)]
     for layer, view in enumerate(maps.views):
         camera, pose = view.camera, view.camera.camera_to_world
@@ -81,7 +87,7 @@ def draw_shadow_maps(device, cloud, maps):
         device.draw(
             "Splats.hlsl",
             ("SplatVertex", "SplatFragment"),
-            ["_BeamShadowSums"],
+            ["_BeamShadowSums", "_BeamShadowFirst"],
             6 * len(cloud),
             layer=layer,
             defines=("BEAM_SHADOW_MAP",),
@@ -115,10 +121,10 @@ def set_light(device, shot, maps):
     device.buffer("_BeamLamps", np.array(rows[1:] or rows, np.float32))
 
 
-def picture(device, golden):
-    """Return radiance multiplied by alpha, and alpha, ``(H, W, 4)``."""
+def picture(device, golden, cloud=None, to_world=None):
+    """Return radiance multiplied by alpha, and alpha, ``(H, W, 4)``; of another cloud, in axes that a matrix turns."""
     shot, maps = golden.shot, shadow_maps(golden)
-    upload_gaussians(device, shot.cloud)
+    upload_gaussians(device, shot.cloud if cloud is None else cloud, to_world)
     draw_shadow_maps(device, shot.cloud, maps)
     set_light(device, shot, maps)
     draw_buffer(device, shot.cloud, shot.camera)

@@ -63,8 +63,14 @@ def cut(take, size):
 
 
 DAMAGES = {
-    "altered segment": (lambda take: damaged(take, lambda b: b.rindex(b"PK\3\4") + 60), "000012.bin must have the digest"),
-    "altered static block": (lambda take: damaged(take, lambda b: b.index(b"static.bin", b.index(b"}]}")) + 99), "static.bin"),
+    "altered segment": (
+        lambda take: damaged(take, lambda b: b.rindex(b"PK\3\4") + 60),
+        "000012.bin must have the digest",
+    ),
+    "altered static block": (
+        lambda take: damaged(take, lambda b: b.index(b"static.bin", b.index(b"}]}")) + 99),
+        "static.bin",
+    ),
     "truncated segment": (lambda take: cut(take, 0.8), r"0000\d\d.bin must have \d+ bytes, got \d+"),
     "truncated manifest": (lambda take: cut(take, 0.01), "manifest.json must have at most"),
     "no file": (lambda take: take.unlink(), "a container must be a file, got no a.b4d"),

@@ -1,15 +1,21 @@
 """The package's HLSL: every entry compiles and validates, and what runs on a Vulkan device is what Python computes."""
 
+import re
+
 import numpy as np
 import pytest
+from engines.probes import PROBES, goldens
 from engines.unity.csharp import needs_mono, run
-from engines.unity.device import Device, needs_glslang
+from engines.unity.device import SHADERS, Device, compiled, needs_glslang
+from engines.unity.pictures import draw_buffer, picture, sort, upload_gaussians
 from engines.unity.takes import walk
 
 from beam_warp import converters
 from beam_warp.converters import WriteOptions
 from beam_warp.converters.delivery import decoder
 from beam_warp.converters.delivery.decoder import Container
+from beam_warp.image.color import linear_to_srgb
+from beam_warp.world.axes import change_axes
 
 pytestmark = needs_glslang
 
@@ -22,38 +28,38 @@ ENTRIES = {
 }
 
 
-def sorted_order(device, positions, way):
-    """Sort as the package does: keys, then eight passes of count, scan and scatter."""
-    count = len(positions)
-    groups = -(-count // 1024)
-    rows = np.zeros((count, 5, 4), np.float32)
-    rows[:, 0, :3] = positions
-    device.buffer("_BeamGaussians", rows)
-    device.buffer("_BeamDigits", np.zeros(16 * groups, np.uint32))
-    device.buffer("_BeamOrdered", np.zeros(count, np.uint32))
-    here, there = (device.buffer("", np.zeros((count, 2), np.uint32)) for _ in range(2))
-    device.set(_BeamObject=np.eye(4), _BeamSortPlane=np.zeros(4), _BeamSortWay=[*way, 0.0])
-    device.set(_BeamSort=[count, groups, 0, 0])
-    device.held["_BeamSorted"] = here
-    device.compute("Sort.hlsl", "Keys", -(-count // 64))
-    for shift in range(0, 32, 4):
-        device.set(_BeamSort=[count, groups, shift, 0])
-        device.held |= {"_BeamUnsorted": here, "_BeamSorted": there}
-        device.compute("Sort.hlsl", "Count", groups)
-        device.compute("Sort.hlsl", "Scan", 1)
-        device.compute("Sort.hlsl", "Scatter", groups)
-        here, there = there, here
-    device.held["_BeamUnsorted"] = here
-    device.compute("Sort.hlsl", "Order", -(-count // 64))
-    return device.array("_BeamOrdered", np.uint32)
+VARIANTS = [
+    *[(file, entry, ()) for file, entries in ENTRIES.items() for entry in entries],
+    *[("Splats.hlsl", entry, ("BEAM_SHADOW_MAP",)) for entry in ENTRIES["Splats.hlsl"]],
+    *[("Splats.hlsl", entry, ("STEREO_INSTANCING_ON", "BEAM_DEPTH_ARRAY")) for entry in ENTRIES["Splats.hlsl"]],
+    *[("Deferred.hlsl", entry, ("STEREO_INSTANCING_ON",)) for entry in ENTRIES["Deferred.hlsl"]],
+]
+
+
+def test_every_entry_compiles_and_validates():
+    for file, entry, defines in VARIANTS:
+        found = compiled(file, entry, *defines)
+        assert found.code[:4] == b"\x03\x02\x23\x07"  # SPIR-V
+        names = {name for name, _ in found.bindings.items()} | found.constants.keys()
+        assert all(re.match(r"_Beam|_CameraDepthTexture$|sampler_Beam|\$Global$", name) for name in names), names
+
+
+def test_every_hlsl_file_is_compiled():
+    included = {"Gaussians.hlsl", "Views.hlsl", "Stereo.hlsl", "Relight.hlsl"}
+    assert {path.name for path in SHADERS.glob("*.hlsl")} == included | ENTRIES.keys()
 
 
 @pytest.mark.parametrize("count", [1, 1023, 1025, 5000])
 def test_splats_are_sorted_and_ties_keep_their_order(count):
     rng = np.random.default_rng(count)
     positions = np.round(rng.normal(size=(count, 3)), 2).astype(np.float32)
-    order = sorted_order(Device(), positions, [0.0, 1.0, 0.0])
-    assert (order == np.argsort(-positions[:, 1], kind="stable")).all()
+    device = Device()
+    rows = np.zeros((count, 5, 4), np.float32)
+    rows[:, 0, :3] = positions
+    device.buffer("_BeamGaussians", rows)
+    device.set(_BeamObject=np.eye(4))
+    sort(device, count, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    assert (device.array("_BeamOrder", np.uint32) == np.argsort(-positions[:, 1], kind="stable")).all()
 
 
 @needs_mono
@@ -103,3 +109,68 @@ def numbers(container, frame):
         for name, track in container.tracks(block, block.get("frames", 1)).items():
             found[name] = found.get(name, 0.0) + np.stack([component.at(at) for component in track])
     return found
+
+
+def psnr(found, wanted):
+    return -10.0 * np.log10(np.square(np.clip(found, 0.0, 1.0) - np.clip(wanted, 0.0, 1.0)).mean())
+
+
+def close_to(golden, found):
+    """Whether a picture is that of the deferred renderer: 40 dB as light, and as it is displayed."""
+    wanted = golden.image.rgb
+    displayed = psnr(linear_to_srgb(np.clip(found[..., :3], 0, 1)), linear_to_srgb(np.clip(wanted, 0, 1)))
+    return min(psnr(found[..., :3], wanted), displayed, psnr(found[..., 3], golden.image.alpha)) >= 40.0
+
+
+def test_a_picture_is_that_of_the_deferred_renderer():
+    (golden,) = goldens(["corner"], ["spot"])
+    assert close_to(golden, picture(Device(), golden))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBES)
+def test_pictures_are_those_of_the_deferred_renderer(name):
+    device = Device()
+    for golden in goldens([name]):
+        assert close_to(golden, picture(device, golden)), golden.lighting
+
+
+def test_a_take_is_turned_with_its_object():
+    """From a container's axes, x right, y up, z back, turned by a matrix: the same picture."""
+    (golden,) = goldens(["tripod"], ["studio"])
+    to_world = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    assert close_to(golden, picture(Device(), golden, change_axes(golden.shot.cloud, "rub"), to_world))
+
+
+def test_opaque_surfaces_hide_splats_behind_them():
+    (golden,) = goldens(["tripod"], ["studio"])
+    cloud, camera = golden.shot.cloud, golden.shot.camera
+    device = Device()
+    upload_gaussians(device, cloud)
+    wall = 2.6  # between the balls
+    draw_buffer(device, cloud, camera, scene_depth=0.01 / wall)
+    rest = device.image("_BeamRest")
+    covered = rest[..., 3] > 0.0
+    depth = rest[covered, 2] / rest[covered, 3]
+    assert (depth < wall + 1e-4).all()
+    behind = (golden.frame.image().layers["depth"] > wall + 0.3) & (golden.image.alpha > 0.9)
+    assert behind.any() and not covered[behind].any()
+
+
+def test_an_even_cube_sheds_pi_times_its_radiance():
+    """Level texels point where the cube's do: its top face, y in Unity, is up."""
+    device = Device()
+    faces = np.full((6, 8, 8, 4), 0.5, np.float32)
+    faces[2, ..., 0] = 2.0
+    device.texture("_BeamCube", faces)
+    device.buffer("_BeamTexels", np.zeros((512 + 128, 4), np.float32))
+    device.set(_BeamLevel=[16, 0, 0, 1], _BeamSource=[16, 0, 0, 0])
+    device.compute("Environment.hlsl", "FromCube", 8)
+    device.set(_BeamLevel=[8, 512, 0, 1])
+    device.compute("Environment.hlsl", "Irradiance", 2)
+    texels = device.array("_BeamTexels", np.float32).reshape(-1, 4)
+    level, irradiance = texels[:512].reshape(16, 32, 4), texels[512:].reshape(8, 16, 4)
+    assert (level[0, :, 0] == 2.0).all() and (level[8:, :, 0] == 0.5).all()
+    np.testing.assert_allclose(level[..., 1:3], 0.5)
+    np.testing.assert_allclose(irradiance[..., 1:3], 0.5 * np.pi, rtol=0.01)  # cosines at 512 middles
+    assert irradiance[0, :, 0].min() > irradiance[-1, :, 0].max()

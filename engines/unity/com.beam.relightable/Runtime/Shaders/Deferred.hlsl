@@ -6,7 +6,9 @@
 Texture2DArray<float4> _BeamLook;
 Texture2DArray<float4> _BeamNormal;
 Texture2DArray<float4> _BeamRest;
+Texture2DArray<float4> _BeamFirst;
 Texture2DArray<float4> _BeamShadowSums; // of Gaussians: depth times alpha, alpha in z and w
+Texture2DArray<float4> _BeamShadowFirst; // depth of the nearest splat that hides half [m], 0 for none
 Texture2DArray<float4> _BeamShadowMeshes; // depth of triangles [m], 0 for none
 StructuredBuffer<float4> _BeamEnvironment; // texels of all levels, and irradiance
 StructuredBuffer<float4> _BeamAlbedo; // (A, B), 64 x 64
@@ -61,7 +63,8 @@ float4 shadowTexel(int map, int2 cell)
     float4 sums = _BeamShadowSums.Load(int4(cell, map, 0));
     float mesh = _BeamShadowMeshes.Load(int4(cell, map, 0)).x;
     float mean = sums.w > 0.0 ? sums.z / sums.w : 0.0;
-    return float4(min(sums.w, 1.0), mean, mean, mesh > 0.0 ? mesh : 3.0e38);
+    float first = _BeamShadowFirst.Load(int4(cell, map, 0)).x;
+    return float4(min(sums.w, 1.0), first > 0.0 ? first : mean, mean, mesh > 0.0 ? mesh : 3.0e38);
 }
 
 Lamp lampAt(int k)
@@ -111,7 +114,9 @@ float4 DeferredFragment(WholeScreen input) : SV_Target0
         discard;
     Pinhole view = eyeView(input.eye);
     float3 ray = pixelRay(float2(pixel) + 0.5, view.focal, view.center, view.right, view.down, view.forward);
-    float depth = rest.z / rest.w;
+    // where the front leaks the mean lies inside the body, where no light arrives
+    float first = _BeamFirst.Load(int4(pixel, input.eye, 0)).x;
+    float depth = first > 0.0 ? min(rest.z / rest.w, first) : rest.z / rest.w;
     Surface surface = surfaceOfSums(look.xyz * (rest.w / max(look.w, 1.0e-6)), rest.x, rest.y, normal.xyz, rest.w, view.position, ray, depth);
     float3 radiance = environmentRadiance(surface, _BeamTurn.xy);
     float2 turn = randomTurn(uint(pixel.y) * uint(_BeamTarget.x) + uint(pixel.x));

@@ -28,6 +28,7 @@ struct Sums
     float4 look : SV_Target0; // base colour, alpha
     float4 normal : SV_Target1; // normal, alpha
     float4 rest : SV_Target2; // roughness, ambient occlusion, depth, alpha
+    float4 first : SV_Target3; // depth of the nearest splat that hides half: blended as if it hid all
 };
 
 SplatCorner SplatVertex(uint vertex : SV_VertexID BEAM_EYE_INPUT)
@@ -61,13 +62,24 @@ Splat splatOf(SplatCorner input)
 }
 
 #if defined(BEAM_SHADOW_MAP)
-float4 SplatFragment(SplatCorner input) : SV_Target0
+struct ShadowSums
+{
+    float4 mean : SV_Target0; // depth in z, alpha
+    float4 first : SV_Target1; // depth of the nearest splat that hides half: blended as if it hid all
+};
+
+ShadowSums SplatFragment(SplatCorner input)
 {
     Splat splat = splatOf(input);
     float alpha = alphaAt(splat, input.offset);
     if (!(alpha > 0.0))
         discard;
-    return float4(0.0, 0.0, depthAt(splat, input.offset, _BeamTarget.w) * alpha, alpha);
+    float depth = depthAt(splat, input.offset, _BeamTarget.w);
+    float hides = alpha >= 0.5 ? 1.0 : 0.0;
+    ShadowSums sums;
+    sums.mean = float4(0.0, 0.0, depth * alpha, alpha);
+    sums.first = float4(depth * hides, 0.0, 0.0, hides);
+    return sums;
 }
 #else
 /// Depth [m] of the scene's opaque surfaces.
@@ -90,6 +102,8 @@ Sums SplatFragment(SplatCorner input)
     Sums sums;
     sums.look = float4(input.look.xyz * alpha, alpha);
     sums.normal = float4(input.normal.xyz * alpha, alpha);
+    float hides = alpha >= 0.5 ? 1.0 : 0.0;
+    sums.first = float4(depth * hides, 0.0, 0.0, hides);
     sums.rest = float4(input.look.w * alpha, input.normal.w * alpha, depth * alpha, alpha);
     return sums;
 }
