@@ -1,22 +1,24 @@
 using System;
 using System.Collections.Generic;
 using System.IO;
+using System.Threading;
 using Beam.Relightable;
 
-/// <summary>Dump TAKE FOLDER writes what the parser reads, or prints its error; Dump TAKE FOLDER FRAME what a GPU gets.</summary>
+/// <summary>Dump TAKE FOLDER writes what the parser reads of a container or a PLY, or prints its error; with a frame, what a GPU
+/// gets; with "stream", it prints what is held while segments are wanted one after the other.</summary>
 public static class Dump {
     public static int Main(string[] arguments) {
         try {
+            if (arguments[0].EndsWith(".ply")) return WriteArrays(PlyFrame.Read(arguments[0]), Path.Combine(arguments[1], ""));
             var take = new Container(arguments[0]);
+            if (arguments.Length == 3 && arguments[2] == "stream") return Stream(take);
             if (arguments.Length == 3) return WriteMoment(take, double.Parse(arguments[2]), arguments[1]);
             Write(take.Still, "static", arguments[1]);
             foreach (BlockEntry entry in take.Segments) {
                 Block block = take.Read(entry);
                 Write(block, Path.GetFileNameWithoutExtension(entry.File), arguments[1]);
-                for (int frame = 0; frame < entry.Frames; frame++) {
-                    foreach (KeyValuePair<string, float[]> pair in take.Frame(block, frame))
-                        WriteFloats(pair.Value, Path.Combine(arguments[1], (entry.First + frame) + "." + pair.Key));
-                }
+                for (int frame = 0; frame < entry.Frames; frame++)
+                    WriteArrays(take.Frame(block, frame), Path.Combine(arguments[1], (entry.First + frame) + "."));
             }
             Console.WriteLine(take.Frames + " " + take.Count + " " + take.Rate + " " + take.IsConstant);
             return 0;
@@ -24,6 +26,23 @@ public static class Dump {
             Console.WriteLine(error.Message);
             return 2;
         }
+    }
+
+    private static int WriteArrays(Dictionary<string, float[]> arrays, string prefix) {
+        foreach (KeyValuePair<string, float[]> pair in arrays) WriteFloats(pair.Value, prefix + pair.Key);
+        return 0;
+    }
+
+    private static int Stream(Container take) {
+        using (var stream = new SegmentStream(take)) {
+            for (int index = 0; index < take.Segments.Count; index++) {
+                stream.Want(index, index + 1 < take.Segments.Count ? index + 1 : -1);
+                string before = stream.Error;
+                for (int wait = 0; wait < 500 && stream.Get(index) == null && stream.Error == before; wait++) Thread.Sleep(5);
+                Console.WriteLine((stream.Get(index) != null) + " " + (stream.Resident <= 2) + " " + stream.Error);
+            }
+        }
+        return 0;
     }
 
     private static int WriteMoment(Container take, double time, string folder) {

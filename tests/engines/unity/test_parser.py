@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from engines.unity.csharp import needs_mono, run
 from engines.unity.takes import walk
+from scipy.spatial.transform import Rotation
 
 from beam_warp import converters
 from beam_warp.converters import WriteOptions
 from beam_warp.converters.delivery.decoder import Container
+from beam_warp.world.axes import change_axes
 
 pytestmark = needs_mono
 
@@ -108,3 +110,66 @@ def test_a_damaged_take_is_refused_in_one_line(dump, sound, tmp_path, name):
     assert done.returncode == 2, done.stderr
     assert done.stdout.count("\n") == 1
     assert re.match(said, done.stdout), done.stdout
+
+
+def test_segments_are_streamed_and_two_are_held(dump, sound, tmp_path):
+    take = tmp_path / "a.b4d"
+    take.write_bytes(sound)
+    done = run(dump, take, tmp_path, "stream")
+    assert done.stdout.split("\n")[:-1] == ["True True "] * 2, done.stderr
+
+
+def test_a_lost_segment_is_named_while_others_are_streamed(dump, sound, tmp_path):
+    take = tmp_path / "a.b4d"
+    take.write_bytes(sound)
+    damaged(take, lambda content: content.rindex(b"PK\3\4") + 60)
+    first, second, _ = run(dump, take, tmp_path, "stream").stdout.split("\n")
+    assert first.startswith("True True")
+    assert second.startswith("False True 000012.bin must have the digest")
+
+
+@pytest.mark.parametrize("axes", ["rdf", "rfu", "luf"])
+def test_a_ply_with_materials_is_read_as_python_reads_it(dump, tmp_path, axes):
+    path = tmp_path / "a.ply"
+    converters.write(walk(40, 1, noise=0.0), path, WriteOptions(profile="beam", axes=axes))
+    (tmp_path / "out").mkdir()
+    done = run(dump, path, tmp_path / "out")
+    assert done.returncode == 0, done.stdout + done.stderr
+    cloud = change_axes(converters.read(path)[0], "rub")
+    found = {each.name: np.fromfile(each, np.float32) for each in (tmp_path / "out").iterdir()}
+    assert found.keys() == cloud.arrays().keys() - {"radiance"}
+    for name, values in found.items():
+        theirs = values.reshape(-1, len(cloud)).T.reshape(cloud.arrays()[name].shape)
+        if name == "orientations":  # axes of a Gaussian may point either way
+            theirs, ours = covariances(theirs, cloud.scales), covariances(cloud.orientations, cloud.scales)
+            np.testing.assert_allclose(theirs, ours, atol=1e-5 * ours.max())
+        else:
+            np.testing.assert_allclose(theirs, cloud.arrays()[name], rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def covariances(orientations, scales):
+    axes = Rotation.from_quat(orientations).as_matrix() * scales[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda content: content[:-1], "a.ply must hold 40 Gaussians of 22 numbers, got"),
+        (
+            lambda content: content.replace(b"comment beam_material linear\n", b""),
+            "a.ply must be written with --profile beam",
+        ),
+        (lambda content: content[:40], "a.ply must have a header that ends"),
+        (lambda content: content.replace(b"vertex 40", b"vertex -4"), "a.ply must have one element, vertex, got"),
+        (lambda content: content.replace(b"float opacity", b"float opasity"), "a.ply must have all properties of the"),
+    ],
+)
+def test_a_malformed_ply_is_refused_in_one_line(dump, tmp_path, change, said):
+    path = tmp_path / "a.ply"
+    converters.write(walk(40, 1, noise=0.0), path, WriteOptions(profile="beam"))
+    path.write_bytes(change(path.read_bytes()))
+    done = run(dump, path, tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout.startswith(said), done.stdout
+    assert done.stdout.count("\n") == 1

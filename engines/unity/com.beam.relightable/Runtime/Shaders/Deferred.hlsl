@@ -9,13 +9,17 @@ Texture2DArray<float4> _BeamRest;
 Texture2DArray<float4> _BeamFirst;
 Texture2DArray<float4> _BeamShadowSums; // of Gaussians: depth times alpha, alpha in z and w
 Texture2DArray<float4> _BeamShadowFirst; // depth of the nearest splat that hides half [m], 0 for none
-Texture2DArray<float4> _BeamShadowMeshes; // depth of triangles [m], 0 for none
+Texture2DArray<float4> _BeamShadowMeshes; // depth of triangles [m]; where there are none, a great one
 StructuredBuffer<float4> _BeamEnvironment; // texels of all levels, and irradiance
 StructuredBuffer<float4> _BeamAlbedo; // (A, B), 64 x 64
 StructuredBuffer<float4> _BeamLamps; // four rows a lamp
 StructuredBuffer<float4> _BeamShadowViews; // six rows a map
 float4 _BeamLevels[14]; // rows, and first texel; the last is the irradiance
 float4 _BeamTurn; // cosine and sine of the environment's angle about z; number of lamps; exposure, a factor
+
+#if defined(BEAM_EXPOSED)
+Texture2D<float4> _ExposureTexture; // HDRP's: colours are multiplied by what it holds
+#endif
 
 #define RELIGHT_FETCHING
 #include "Relight.hlsl"
@@ -64,7 +68,7 @@ float4 shadowTexel(int map, int2 cell)
     float mesh = _BeamShadowMeshes.Load(int4(cell, map, 0)).x;
     float mean = sums.w > 0.0 ? sums.z / sums.w : 0.0;
     float first = _BeamShadowFirst.Load(int4(cell, map, 0)).x;
-    return float4(min(sums.w, 1.0), first > 0.0 ? first : mean, mean, mesh > 0.0 ? mesh : 3.0e38);
+    return float4(min(sums.w, 1.0), first > 0.0 ? first : mean, mean, mesh);
 }
 
 Lamp lampAt(int k)
@@ -122,7 +126,12 @@ float4 DeferredFragment(WholeScreen input) : SV_Target0
     float2 turn = randomTurn(uint(pixel.y) * uint(_BeamTarget.x) + uint(pixel.x));
     for (int k = 0; k < int(_BeamTurn.z); k++)
         radiance += lampRadiance(surface, lampAt(k), turn);
-    return float4(radiance * (alpha * _BeamTurn.w), alpha);
+    float gain = _BeamTurn.w;
+#if defined(BEAM_EXPOSED)
+    int2 only = int2(0, 0);
+    gain *= _ExposureTexture.Load(int3(only, 0)).x;
+#endif
+    return float4(radiance * (alpha * gain), alpha);
 }
 
 /// Depth of the take for what is drawn later, where it hides more than half.
