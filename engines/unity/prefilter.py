@@ -2,8 +2,9 @@
 
     python engines/unity/prefilter.py hall.hdr hall.bytes
 
-A lat-long image becomes rows of 14 maps as 32-bit integers, then their texels as 32-bit floats, little-endian: 13 levels of
-blurred radiance, the mirror's first, and irradiance; columns are twice the rows, RGB. Unity imports ``.bytes`` as it is.
+A lat-long image becomes the rows of 14 maps as 32-bit integers, then their texels, RGB, as 32-bit floats, all
+little-endian: 13 levels of blurred radiance, the mirror's first, and irradiance. Columns are twice the rows. Unity imports
+``.bytes`` as it is.
 """
 
 from __future__ import annotations

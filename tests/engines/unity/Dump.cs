@@ -9,7 +9,7 @@ using Beam.Relightable;
 public static class Dump {
     public static int Main(string[] arguments) {
         try {
-            if (arguments[0].EndsWith(".ply")) return WriteArrays(PlyFrame.Read(arguments[0]), Path.Combine(arguments[1], ""));
+            if (arguments[0].EndsWith(".ply")) return WriteArrays(PlyFrame.Read(arguments[0]), arguments[1] + "/");
             var take = new Container(arguments[0]);
             if (arguments.Length == 3 && arguments[2] == "stream") return Stream(take);
             if (arguments.Length == 3) return WriteMoment(take, double.Parse(arguments[2]), arguments[1]);

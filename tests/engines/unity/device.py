@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from engines.unity.csharp import PACKAGE
+from engines.unity.csharp import HERE, PACKAGE
 
 SHADERS = PACKAGE / "Runtime" / "Shaders"
 GLSLANG = shutil.which("glslangValidator")
 SPIRV_DIS = shutil.which("spirv-dis")
 SPIRV_VAL = shutil.which("spirv-val")
 TARGET = "vulkan1.1"
+MATRICES = ("_BeamCamera", "_BeamObject", "unity_MatrixVP", "unity_ObjectToWorld")
 STAGES = {"Vertex": "vert", "Fragment": "frag"}
 
 needs_glslang = pytest.mark.skipif(
@@ -44,16 +45,12 @@ def compiled(file, entry, *defines):
     """Compile an entry point and validate it."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out.spv"
-        command = [GLSLANG, "-D", "-V", "--target-env", TARGET, "--auto-map-bindings", "--auto-map-locations"]
-        command += ["--hlsl-iomap", "--quiet", "-S", stage_of(entry), "-e", entry, *(f"-D{name}" for name in defines)]
-        command += [
-            f"-I{SHADERS}",
-            "--resource-set-binding",
-            "1" if stage_of(entry) == "frag" else "0",
-            "-o",
-            str(out),
-            str(SHADERS / file),
-        ]
+        stage = stage_of(entry)
+        command = [GLSLANG, "-D", "-V", "--quiet", "--target-env", TARGET, "-S", stage, "-e", entry]
+        command += ["--auto-map-bindings", "--auto-map-locations", "--hlsl-iomap"]
+        command += ["--resource-set-binding", "1" if stage == "frag" else "0"]  # stages have groups of their own
+        command += [f"-I{SHADERS}", f"-I{HERE / 'stubs'}", *(f"-D{name}" for name in defines)]
+        command += ["-o", str(out), str(SHADERS / file)]
         run = subprocess.run(command, capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stdout + run.stderr
         run = subprocess.run([SPIRV_VAL, "--target-env", TARGET, out], capture_output=True, text=True, check=False)
@@ -86,6 +83,14 @@ def adapter():
         return wgpu.gpu.request_adapter_sync()
     except RuntimeError as error:
         pytest.skip(f"there is no Vulkan device: {error}")
+
+
+BLENDS = {
+    "over": {"src_factor": "one", "dst_factor": "one-minus-src-alpha", "operation": "add"},
+    "least": {"src_factor": "one", "dst_factor": "one", "operation": "min"},
+    "none": None,
+}
+"""Blending of the passes of Relight.shader."""
 
 
 class Device:
@@ -144,7 +149,7 @@ class Device:
         """Set constants: rows of float4; matrices as ``(…, 4, 4)`` arrays, as HLSL indexes them."""
         for name, value in constants.items():
             array = np.asarray(value, np.float32)
-            if name in ("_BeamCamera", "_BeamObject"):
+            if name in MATRICES:
                 array = np.swapaxes(array, -1, -2)
             self.constants[name] = np.ascontiguousarray(array).tobytes()
 
@@ -195,16 +200,18 @@ class Device:
         work.end()
         self.device.queue.submit([encoder.finish()])
 
-    def draw(self, file, entries, targets, vertices, *, layer=0, defines=(), blended=True, clear=True):
-        """Draw triangles into textures of those names."""
+    def draw(self, file, entries, targets, vertices, *, layer=0, defines=(), blend="over", clear=0.0, corners=None):
+        """Draw triangles, of corners ``(vertices, 3)`` if there are any, into textures of those names."""
         found = [compiled(file, entry, *defines) for entry in entries]
         vertex, fragment = (self.device.create_shader_module(code=each.code) for each in found)
-        part = {"src_factor": "one", "dst_factor": "one-minus-src-alpha", "operation": "add"}
-        state = {"blend": {"color": part, "alpha": part}} if blended else {}
+        part = BLENDS[blend]
+        state = {"blend": {"color": part, "alpha": part}} if part else {}
+        place = {"format": "float32x3", "offset": 0, "shader_location": 0}
+        layout = {"array_stride": 12, "step_mode": "vertex", "attributes": [place]}
         states = [state | {"format": self.held[name].format} for name in targets]
         pipeline = self.device.create_render_pipeline(
             layout="auto",
-            vertex={"module": vertex, "entry_point": entries[0], "buffers": []},
+            vertex={"module": vertex, "entry_point": entries[0], "buffers": [] if corners is None else [layout]},
             primitive={"topology": "triangle-list", "cull_mode": "none"},
             fragment={"module": fragment, "entry_point": entries[1], "targets": states},
         )
@@ -212,9 +219,9 @@ class Device:
         attachments = [
             {
                 "view": self.held[name].create_view(dimension="2d", base_array_layer=layer, array_layer_count=1),
-                "load_op": "clear" if clear else "load",
+                "load_op": "clear",
                 "store_op": "store",
-                "clear_value": (0, 0, 0, 0),
+                "clear_value": (clear, 0, 0, 0),
             }
             for name in targets
         ]
@@ -222,6 +229,10 @@ class Device:
         work.set_pipeline(pipeline)
         for group, bound in self._groups(pipeline, found).items():
             work.set_bind_group(group, bound)
+        if corners is not None:
+            content = np.ascontiguousarray(corners, np.float32).tobytes()
+            buffer = self.device.create_buffer_with_data(data=content, usage=self.wgpu.BufferUsage.VERTEX)
+            work.set_vertex_buffer(0, buffer)
         work.draw(vertices)
         work.end()
         self.device.queue.submit([encoder.finish()])

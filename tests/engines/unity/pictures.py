@@ -77,8 +77,9 @@ def draw_buffer(device, cloud, camera, scene_depth=0.0):
 
 def draw_shadow_maps(device, cloud, maps):
     """Draw the shadow maps of all lamps."""
-    for name in ("_BeamShadowSums", "_BeamShadowFirst", "_BeamShadowMeshes"):
+    for name in ("_BeamShadowSums", "_BeamShadowFirst"):
         device.target(name, max(len(maps.views), 1), MAP_SIZE, MAP_SIZE)
+    device.texture("_BeamShadowMeshes", np.full((max(len(maps.views), 1), MAP_SIZE, MAP_SIZE, 4), 3e38))
     rows = [np.zeros(24)]
     for layer, view in enumerate(maps.views):
         camera, pose = view.camera, view.camera.camera_to_world
@@ -129,5 +130,5 @@ def picture(device, golden, cloud=None, to_world=None):
     set_light(device, shot, maps)
     draw_buffer(device, shot.cloud, shot.camera)
     device.target("picture", 1, shot.camera.height, shot.camera.width)
-    device.draw("Deferred.hlsl", ("DeferredVertex", "DeferredFragment"), ["picture"], 3, blended=False)
+    device.draw("Deferred.hlsl", ("DeferredVertex", "DeferredFragment"), ["picture"], 3, blend="none")
     return device.image("picture")

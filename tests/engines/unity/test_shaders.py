@@ -7,7 +7,7 @@ import pytest
 from engines.probes import PROBES, goldens
 from engines.unity.csharp import needs_mono, run
 from engines.unity.device import SHADERS, Device, compiled, needs_glslang
-from engines.unity.pictures import draw_buffer, picture, sort, upload_gaussians
+from engines.unity.pictures import draw_buffer, picture, set_view, sort, upload_gaussians
 from engines.unity.takes import walk
 
 from beam_warp import converters
@@ -16,6 +16,7 @@ from beam_warp.converters.delivery import decoder
 from beam_warp.converters.delivery.decoder import Container
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import Camera
 
 pytestmark = needs_glslang
 
@@ -24,6 +25,8 @@ ENTRIES = {
     "Sort.hlsl": ("Keys", "Count", "Scan", "Scatter", "Order"),
     "Environment.hlsl": ("FromCube", "Irradiance"),
     "Splats.hlsl": ("SplatVertex", "SplatFragment"),
+    "Meshes.hlsl": ("MeshVertex", "MeshFragment"),
+    "Caster.hlsl": ("CasterVertex", "CasterFragment"),
     "Deferred.hlsl": ("DeferredVertex", "DeferredFragment", "DepthFragment"),
 }
 
@@ -32,6 +35,8 @@ VARIANTS = [
     *[(file, entry, ()) for file, entries in ENTRIES.items() for entry in entries],
     *[("Splats.hlsl", entry, ("BEAM_SHADOW_MAP",)) for entry in ENTRIES["Splats.hlsl"]],
     *[("Splats.hlsl", entry, ("STEREO_INSTANCING_ON", "BEAM_DEPTH_ARRAY")) for entry in ENTRIES["Splats.hlsl"]],
+    *[("Caster.hlsl", entry, ("BEAM_HDRP",)) for entry in ENTRIES["Caster.hlsl"]],
+    ("Deferred.hlsl", "DeferredFragment", ("BEAM_EXPOSED",)),
     *[("Deferred.hlsl", entry, ("STEREO_INSTANCING_ON",)) for entry in ENTRIES["Deferred.hlsl"]],
 ]
 
@@ -41,7 +46,10 @@ def test_every_entry_compiles_and_validates():
         found = compiled(file, entry, *defines)
         assert found.code[:4] == b"\x03\x02\x23\x07"  # SPIR-V
         names = {name for name, _ in found.bindings.items()} | found.constants.keys()
-        assert all(re.match(r"_Beam|_CameraDepthTexture$|sampler_Beam|\$Global$", name) for name in names), names
+        assert all(
+            re.match(r"_Beam|sampler_Beam|\$Global$|unity_|_(CameraDepth|Exposure)Texture$|_World", name)
+            for name in names
+        ), names
 
 
 def test_every_hlsl_file_is_compiled():
@@ -154,7 +162,8 @@ def test_opaque_surfaces_hide_splats_behind_them():
     depth = rest[covered, 2] / rest[covered, 3]
     assert (depth < wall + 1e-4).all()
     behind = (golden.frame.image().layers["depth"] > wall + 0.3) & (golden.image.alpha > 0.9)
-    assert behind.any() and not covered[behind].any()
+    assert behind.any()
+    assert not covered[behind].any()
 
 
 def test_an_even_cube_sheds_pi_times_its_radiance():
@@ -170,7 +179,40 @@ def test_an_even_cube_sheds_pi_times_its_radiance():
     device.compute("Environment.hlsl", "Irradiance", 2)
     texels = device.array("_BeamTexels", np.float32).reshape(-1, 4)
     level, irradiance = texels[:512].reshape(16, 32, 4), texels[512:].reshape(8, 16, 4)
-    assert (level[0, :, 0] == 2.0).all() and (level[8:, :, 0] == 0.5).all()
+    assert (level[0, :, 0] == 2.0).all()
+    assert (level[8:, :, 0] == 0.5).all()
     np.testing.assert_allclose(level[..., 1:3], 0.5)
     np.testing.assert_allclose(irradiance[..., 1:3], 0.5 * np.pi, rtol=0.01)  # cosines at 512 middles
     assert irradiance[0, :, 0].min() > irradiance[-1, :, 0].max()
+
+
+def test_meshes_are_in_shadow_maps_by_their_depth():
+    """A wall across the view of a lamp, and its place in Unity's axes: y up, z forward."""
+    device = Device()
+    camera = Camera.look_at((0.0, -2.0, 0.5), (0.0, 0.0, 0.5), width=32, height=32, vertical_fov=60.0)
+    set_view(device, camera)
+    device.set(unity_ObjectToWorld=[[1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 1, 1.0], [0, 0, 0, 1]])
+    device.target("map", 1, 32, 32)
+    corners = [(-9, -9, 0), (9, -9, 0), (-9, 0, 0), (9, -9, 0), (9, 0, 0), (-9, 0, 0)]  # lower half of the view
+    meshes = ("MeshVertex", "MeshFragment")
+    device.draw("Meshes.hlsl", meshes, ["map"], 6, blend="least", clear=3e38, corners=corners)
+    found = device.image("map")[..., 0]
+    np.testing.assert_allclose(found[16:], 3.0, rtol=1e-5)
+    assert (found[:16] > 1e38).all()
+
+
+def test_a_take_casts_shadows_where_it_hides_half():
+    """Under a parallel light the shadow of a Gaussian is the ellipse in which its alpha is at least a half."""
+    device = Device()
+    place, sigmas, opacity = (0.1, 0.0, -0.2), (0.2, 0.05, 0.1), 0.9
+    ball = [*place, opacity, 0, 0, 0, 1, *sigmas, 0.5, 0.5, 0.5, 0.5, 1, 0, 0, 1, 0]
+    device.buffer("_BeamGaussians", np.array(ball, np.float32))
+    device.set(_BeamObject=np.eye(4), unity_MatrixVP=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0.1, 0.5], [0, 0, 0, 1]])
+    device.target("map", 1, 256, 256)
+    device.draw("Caster.hlsl", ("CasterVertex", "CasterFragment"), ["map"], 6, blend="none")
+    found = device.image("map")[..., 0]
+    y, x = np.mgrid[1 : -1 : -1 / 128, -1 : 1 : 1 / 128] + np.array([-1, 1])[:, None, None] / 256
+    e = ((x - place[0]) / sigmas[0]) ** 2 + ((y - place[2]) / sigmas[2]) ** 2  # Unity's y is the world's z
+    wanted = opacity * np.exp(-0.5 * e) >= 0.5
+    assert wanted.any()
+    assert (found == wanted).mean() > 0.999

@@ -62,5 +62,5 @@ float4 CasterFragment(CasterCorner input) : SV_Target0
 {
     if (!(input.opacity * exp(-0.5 * dot(input.e, input.e)) >= 0.5))
         discard;
-    return float4(0.0, 0.0, 0.0, 0.0);
+    return float4(1.0, 1.0, 1.0, 1.0); // masked in the shadow pass
 }
