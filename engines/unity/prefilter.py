@@ -2,9 +2,8 @@
 
     python engines/unity/prefilter.py hall.hdr hall.bytes
 
-A lat-long image becomes the rows of 14 maps as 32-bit integers, then their texels, RGB, as 32-bit floats, all
-little-endian: 13 levels of blurred radiance, the mirror's first, and irradiance. Columns are twice the rows. Unity imports
-``.bytes`` as it is.
+A lat-long image becomes the rows of 14 maps as 32-bit integers, then their texels, RGB, as 32-bit floats. Numbers are
+little-endian. Maps are 13 levels of blurred radiance, the mirror's first, and irradiance; columns are twice the rows.
 """
 
 from __future__ import annotations

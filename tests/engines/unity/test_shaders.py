@@ -57,6 +57,7 @@ def test_every_hlsl_file_is_compiled():
     assert {path.name for path in SHADERS.glob("*.hlsl")} == included | ENTRIES.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 1023, 1025, 5000])
 def test_splats_are_sorted_and_ties_keep_their_order(count):
     rng = np.random.default_rng(count)
@@ -71,6 +72,7 @@ def test_splats_are_sorted_and_ties_keep_their_order(count):
 
 
 @needs_mono
+@pytest.mark.slow
 @pytest.mark.parametrize("time", [0.0, 5.0, 13.0, 4.25, 11.5])
 def test_a_moment_is_evaluated_as_python_evaluates_it(dump, tmp_path, time):
     """Between two frames it is evaluated from the blend of their numbers, across segments, too."""
@@ -130,11 +132,6 @@ def close_to(golden, found):
     return min(psnr(found[..., :3], wanted), displayed, psnr(found[..., 3], golden.image.alpha)) >= 40.0
 
 
-def test_a_picture_is_that_of_the_deferred_renderer():
-    (golden,) = goldens(["corner"], ["spot"])
-    assert close_to(golden, picture(Device(), golden))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROBES)
 def test_pictures_are_those_of_the_deferred_renderer(name):
@@ -143,6 +140,7 @@ def test_pictures_are_those_of_the_deferred_renderer(name):
         assert close_to(golden, picture(device, golden)), golden.lighting
 
 
+@pytest.mark.slow
 def test_a_take_is_turned_with_its_object():
     """From a container's axes, x right, y up, z back, turned by a matrix: the same picture."""
     (golden,) = goldens(["tripod"], ["studio"])
@@ -150,6 +148,7 @@ def test_a_take_is_turned_with_its_object():
     assert close_to(golden, picture(Device(), golden, change_axes(golden.shot.cloud, "rub"), to_world))
 
 
+@pytest.mark.slow
 def test_opaque_surfaces_hide_splats_behind_them():
     (golden,) = goldens(["tripod"], ["studio"])
     cloud, camera = golden.shot.cloud, golden.shot.camera
@@ -166,6 +165,7 @@ def test_opaque_surfaces_hide_splats_behind_them():
     assert not covered[behind].any()
 
 
+@pytest.mark.slow
 def test_an_even_cube_sheds_pi_times_its_radiance():
     """Level texels point where the cube's do: its top face, y in Unity, is up."""
     device = Device()
@@ -186,6 +186,7 @@ def test_an_even_cube_sheds_pi_times_its_radiance():
     assert irradiance[0, :, 0].min() > irradiance[-1, :, 0].max()
 
 
+@pytest.mark.slow
 def test_meshes_are_in_shadow_maps_by_their_depth():
     """A wall across the view of a lamp, and its place in Unity's axes: y up, z forward."""
     device = Device()
@@ -201,6 +202,7 @@ def test_meshes_are_in_shadow_maps_by_their_depth():
     assert (found[:16] > 1e38).all()
 
 
+@pytest.mark.slow
 def test_a_take_casts_shadows_where_it_hides_half():
     """Under a parallel light the shadow of a Gaussian is the ellipse in which its alpha is at least a half."""
     device = Device()

@@ -1,4 +1,5 @@
-// The part of Unity's API that the package calls, as declarations of ours: enough to compile against, nothing runs.
+// The part of Unity's API that the package calls, as declarations of ours: enough to compile against. Vectors and matrices
+// work, so that Adapter.cs can ask for cameras and lamps; all else does nothing.
 #pragma warning disable 67, 169, 649, 660, 661
 using System;
 using System.Collections.Generic;
@@ -9,54 +10,82 @@ namespace UnityEngine {
     public struct Vector2 {
         public float x, y;
         public Vector2(float x, float y) { this.x = x; this.y = y; }
-        public static Vector2 one;
-        public static Vector2 operator *(Vector2 a, float b) => a;
-        public static implicit operator Vector4(Vector2 v) => new Vector4();
-        public static implicit operator Vector2(Vector3 v) => new Vector2();
+        public static Vector2 one => new Vector2(1, 1);
+        public static Vector2 operator *(Vector2 a, float b) => new Vector2(a.x * b, a.y * b);
+        public static implicit operator Vector4(Vector2 v) => new Vector4(v.x, v.y, 0, 0);
     }
     public struct Vector2Int {
         public int x, y;
         public Vector2Int(int x, int y) { this.x = x; this.y = y; }
-        public static implicit operator Vector2(Vector2Int v) => new Vector2();
+        public static implicit operator Vector2(Vector2Int v) => new Vector2(v.x, v.y);
     }
     public struct Vector3 {
         public float x, y, z;
         public Vector3(float x, float y, float z) { this.x = x; this.y = y; this.z = z; }
-        public float this[int k] { get { return x; } set { x = value; } }
-        public float magnitude => x;
-        public Vector3 normalized => this;
-        public static Vector3 zero, one, up, down, left, right, forward, back;
-        public static Vector3 operator +(Vector3 a, Vector3 b) => a;
-        public static Vector3 operator -(Vector3 a, Vector3 b) => a;
-        public static Vector3 operator -(Vector3 a) => a;
-        public static Vector3 operator *(Vector3 a, float b) => a;
-        public static Vector3 operator *(float a, Vector3 b) => b;
-        public static Vector3 Cross(Vector3 a, Vector3 b) => a;
-        public static float Distance(Vector3 a, Vector3 b) => 0;
+        public float this[int k] {
+            get { return k == 0 ? x : k == 1 ? y : z; }
+            set { if (k == 0) x = value; else if (k == 1) y = value; else z = value; }
+        }
+        public float magnitude => (float)Math.Sqrt(x * x + y * y + z * z);
+        public Vector3 normalized => this * (1 / magnitude);
+        public static Vector3 zero => new Vector3(0, 0, 0);
+        public static Vector3 one => new Vector3(1, 1, 1);
+        public static Vector3 right => new Vector3(1, 0, 0);
+        public static Vector3 left => -right;
+        public static Vector3 up => new Vector3(0, 1, 0);
+        public static Vector3 down => -up;
+        public static Vector3 forward => new Vector3(0, 0, 1);
+        public static Vector3 back => -forward;
+        public static Vector3 operator +(Vector3 a, Vector3 b) => new Vector3(a.x + b.x, a.y + b.y, a.z + b.z);
+        public static Vector3 operator -(Vector3 a, Vector3 b) => a + -b;
+        public static Vector3 operator -(Vector3 a) => a * -1;
+        public static Vector3 operator *(Vector3 a, float b) => new Vector3(a.x * b, a.y * b, a.z * b);
+        public static Vector3 operator *(float a, Vector3 b) => b * a;
+        public static Vector3 Cross(Vector3 a, Vector3 b) => new Vector3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
+        public static float Distance(Vector3 a, Vector3 b) => (a - b).magnitude;
     }
     public struct Vector4 {
         public float x, y, z, w;
         public Vector4(float x, float y, float z, float w) { this.x = x; this.y = y; this.z = z; this.w = w; }
-        public static implicit operator Vector3(Vector4 v) => new Vector3();
-        public static implicit operator Vector4(Vector3 v) => new Vector4();
+        public static implicit operator Vector3(Vector4 v) => new Vector3(v.x, v.y, v.z);
+        public static implicit operator Vector4(Vector3 v) => new Vector4(v.x, v.y, v.z, 0);
     }
     public struct Quaternion { public static Quaternion Euler(float x, float y, float z) => new Quaternion(); }
     public struct Matrix4x4 {
-        public Matrix4x4(Vector4 a, Vector4 b, Vector4 c, Vector4 d) { }
-        public static Matrix4x4 identity;
-        public Matrix4x4 inverse => this;
-        public float this[int row, int column] { get { return 0; } set { } }
-        public Vector4 GetColumn(int k) => new Vector4();
-        public void SetRow(int k, Vector4 row) { }
-        public static Matrix4x4 Scale(Vector3 v) => identity;
-        public static Matrix4x4 operator *(Matrix4x4 a, Matrix4x4 b) => a;
+        private float[] m; // row by row
+        public Matrix4x4(Vector4 a, Vector4 b, Vector4 c, Vector4 d) {
+            m = new[] { a.x, b.x, c.x, d.x, a.y, b.y, c.y, d.y, a.z, b.z, c.z, d.z, a.w, b.w, c.w, d.w };
+        }
+        public static Matrix4x4 identity => Scale(new Vector3(1, 1, 1));
+        public float this[int row, int column] {
+            get { return m[4 * row + column]; }
+            set { (m = m == null ? new float[16] : (float[])m.Clone())[4 * row + column] = value; }
+        }
+        public Vector4 GetColumn(int k) => new Vector4(m[k], m[4 + k], m[8 + k], m[12 + k]);
+        public void SetRow(int k, Vector4 row) { this[k, 0] = row.x; this[k, 1] = row.y; this[k, 2] = row.z; this[k, 3] = row.w; }
+        public static Matrix4x4 Scale(Vector3 v) => new Matrix4x4(new Vector4(v.x, 0, 0, 0), new Vector4(0, v.y, 0, 0), new Vector4(0, 0, v.z, 0), new Vector4(0, 0, 0, 1));
+        public static Matrix4x4 operator *(Matrix4x4 a, Matrix4x4 b) {
+            var found = new Matrix4x4();
+            for (int k = 0; k < 16; k++)
+                found[k / 4, k % 4] = a[k / 4, 0] * b[0, k % 4] + a[k / 4, 1] * b[1, k % 4] + a[k / 4, 2] * b[2, k % 4] + a[k / 4, 3] * b[3, k % 4];
+            return found;
+        }
+        public Matrix4x4 inverse { // of a rigid motion
+            get {
+                Vector3 t = GetColumn(3);
+                var turned = new Matrix4x4(new Vector4(m[0], m[1], m[2], 0), new Vector4(m[4], m[5], m[6], 0), new Vector4(m[8], m[9], m[10], 0), new Vector4(0, 0, 0, 1));
+                var shift = identity;
+                for (int k = 0; k < 3; k++) shift[k, 3] = -t[k];
+                return turned * shift;
+            }
+        }
     }
     public struct Color {
         public float r, g, b, a;
         public Color(float r, float g, float b, float a) { this.r = r; this.g = g; this.b = b; this.a = a; }
         public static Color clear;
         public Color linear => this;
-        public static Color operator *(Color a, float b) => a;
+        public static Color operator *(Color a, float b) => new Color(a.r * b, a.g * b, a.b * b, a.a * b);
         public static Color operator *(Color a, Color b) => a;
     }
     public struct Rect { public Rect(float x, float y, float width, float height) { } }
@@ -67,21 +96,21 @@ namespace UnityEngine {
     }
     public static class Mathf {
         public const float PI = 3.14159265f, Deg2Rad = PI / 180f;
-        public static float Max(float a, float b) => a;
-        public static int Max(int a, int b) => a;
-        public static float Min(float a, float b) => a;
-        public static int Min(int a, int b) => a;
-        public static float Abs(float a) => a;
-        public static float Sin(float a) => a;
-        public static float Cos(float a) => a;
-        public static float Tan(float a) => a;
-        public static float Asin(float a) => a;
-        public static float Pow(float a, float b) => a;
-        public static float Floor(float a) => a;
-        public static int CeilToInt(float a) => 0;
-        public static int Clamp(int a, int low, int high) => a;
-        public static float Clamp(float a, float low, float high) => a;
-        public static float Repeat(float a, float length) => a;
+        public static float Max(float a, float b) => Math.Max(a, b);
+        public static int Max(int a, int b) => Math.Max(a, b);
+        public static float Min(float a, float b) => Math.Min(a, b);
+        public static int Min(int a, int b) => Math.Min(a, b);
+        public static float Abs(float a) => Math.Abs(a);
+        public static float Sin(float a) => (float)Math.Sin(a);
+        public static float Cos(float a) => (float)Math.Cos(a);
+        public static float Tan(float a) => (float)Math.Tan(a);
+        public static float Asin(float a) => (float)Math.Asin(a);
+        public static float Pow(float a, float b) => (float)Math.Pow(a, b);
+        public static float Floor(float a) => (float)Math.Floor(a);
+        public static int CeilToInt(float a) => (int)Math.Ceiling(a);
+        public static int Clamp(int a, int low, int high) => Math.Max(low, Math.Min(a, high));
+        public static float Clamp(float a, float low, float high) => Math.Max(low, Math.Min(a, high));
+        public static float Repeat(float a, float length) => a - length * Floor(a / length);
         public static Color CorrelatedColorTemperatureToRGB(float kelvin) => new Color();
     }
     public class Object {
@@ -164,7 +193,16 @@ namespace UnityEngine {
         public Matrix4x4 GetStereoViewMatrix(StereoscopicEye eye) => Matrix4x4.identity;
         public Matrix4x4 GetStereoNonJitteredProjectionMatrix(StereoscopicEye eye) => Matrix4x4.identity;
     }
-    public static class GL { public static Matrix4x4 GetGPUProjectionMatrix(Matrix4x4 projection, bool intoTexture) => projection; }
+    public static class GL { // of Direct3D: near is stored as 1, far as 0
+        public static Matrix4x4 GetGPUProjectionMatrix(Matrix4x4 projection, bool intoTexture) {
+            Matrix4x4 stored = projection;
+            for (int k = 0; k < 4; k++) {
+                stored[1, k] = intoTexture ? -projection[1, k] : projection[1, k];
+                stored[2, k] = 0.5f * (projection[3, k] - projection[2, k]);
+            }
+            return stored;
+        }
+    }
     public static class SystemInfo { public static bool graphicsUVStartsAtTop; }
     public static class Time { public static float deltaTime; }
     public static class Application { public static bool isPlaying, isEditor; public static string streamingAssetsPath; }

@@ -1,0 +1,1 @@
+"""Tests of engines: a package, because `benchmarks/engines.py` has its name."""
