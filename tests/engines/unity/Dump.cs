@@ -63,12 +63,12 @@ public static class Dump {
     }
 
     private static void Write(Block block, string name, string folder) {
-        foreach (KeyValuePair<string, Component[]> pair in block.Arrays) {
+        foreach (KeyValuePair<string, BlockComponent[]> pair in block.Arrays) {
             for (int c = 0; c < pair.Value.Length; c++) {
                 string path = Path.Combine(folder, name + "." + pair.Key + c);
                 WriteFloats(pair.Value[c].Weights, path + ".weights");
                 var numbers = new List<float>();
-                foreach (Plane plane in pair.Value[c].Planes)
+                foreach (BlockPlane plane in pair.Value[c].Planes)
                     for (int i = 0; i < block.Count; i++) numbers.Add(block.At(plane, i));
                 WriteFloats(numbers.ToArray(), path + ".planes");
             }

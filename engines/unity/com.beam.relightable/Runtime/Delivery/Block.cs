@@ -4,7 +4,7 @@ using System.Text;
 
 namespace Beam.Relightable {
     /// <summary>A plane of numbers, one a Gaussian, in <see cref="Block.Planes"/>.</summary>
-    public struct Plane {
+    public struct BlockPlane {
         /// <summary>First byte, a multiple of 4.</summary>
         public int Offset;
 
@@ -13,16 +13,16 @@ namespace Beam.Relightable {
     }
 
     /// <summary>A component of an array: at frame f it is weights[f][0] + Σ weights[f][1 + k] plane[k].</summary>
-    public sealed class Component {
+    public sealed class BlockComponent {
         public float[] Weights;
         public int Columns;
-        public Plane[] Planes;
+        public BlockPlane[] Planes;
     }
 
     /// <summary>An unpacked block: its arrays by name, a component after the other.</summary>
     public sealed class Block {
         private const float Largest = 1e6f;
-        public readonly Dictionary<string, Component[]> Arrays = new Dictionary<string, Component[]>();
+        public readonly Dictionary<string, BlockComponent[]> Arrays = new Dictionary<string, BlockComponent[]>();
 
         /// <summary>All planes, decoded: summed ones as floats, others as integers.</summary>
         public readonly byte[] Planes;
@@ -37,12 +37,12 @@ namespace Beam.Relightable {
             DeliveryException.Require(at >= 4 && at <= content.Length, "its header must be inside", at);
             var said = (Dictionary<string, object>)Json.Parse(Encoding.UTF8.GetString(content, 4, at - 4));
             var sizes = new List<int[]>();
-            var components = new List<Component>();
+            var components = new List<BlockComponent>();
             foreach (Dictionary<string, object> array in (List<object>)said["arrays"]) {
                 string name = (string)array["name"];
                 var pairs = (List<object>)array["planes"];
                 DeliveryException.Require(pairs.Count == ComponentsOf(name), "arrays must be known", name);
-                Arrays[name] = new Component[pairs.Count];
+                Arrays[name] = new BlockComponent[pairs.Count];
                 for (int c = 0; c < pairs.Count; c++) {
                     sizes.Add(SizesOf((List<object>)pairs[c]));
                     components.Add(Arrays[name][c] = Weighed(content, ref at, frames, 1 + sizes[sizes.Count - 1].Length, name));
@@ -67,7 +67,7 @@ namespace Beam.Relightable {
         }
 
         /// <summary>Return a number of a plane.</summary>
-        public float At(Plane plane, int i) {
+        public float At(BlockPlane plane, int i) {
             if (plane.Kind == 0) return BitConverter.ToSingle(Planes, plane.Offset + 4 * i);
             if (plane.Kind == 1) return (sbyte)Planes[plane.Offset + i];
             return plane.Kind == 2 ? BitConverter.ToInt16(Planes, plane.Offset + 2 * i) : BitConverter.ToInt32(Planes, plane.Offset + 4 * i);
@@ -75,9 +75,9 @@ namespace Beam.Relightable {
 
         /// <summary>Add the numbers of an array at a frame, component after component, to some of as many.</summary>
         public void AddTo(float[] values, string name, int frame) {
-            Component[] components = Arrays[name];
+            BlockComponent[] components = Arrays[name];
             for (int c = 0; c < components.Length; c++) {
-                Component each = components[c];
+                BlockComponent each = components[c];
                 int row = frame * each.Columns;
                 for (int i = 0; i < Count; i++) {
                     double sum = values[c * Count + i] + (double)each.Weights[row];
@@ -103,9 +103,9 @@ namespace Beam.Relightable {
             return sizes;
         }
 
-        private static Component Weighed(byte[] content, ref int at, int frames, int columns, string name) {
+        private static BlockComponent Weighed(byte[] content, ref int at, int frames, int columns, string name) {
             DeliveryException.Require(4L * frames * columns <= content.Length - at, "weights must be there", name);
-            var found = new Component { Columns = columns, Weights = new float[frames * columns], Planes = new Plane[columns - 1] };
+            var found = new BlockComponent { Columns = columns, Weights = new float[frames * columns], Planes = new BlockPlane[columns - 1] };
             Buffer.BlockCopy(content, at, found.Weights, 0, 4 * found.Weights.Length);
             foreach (float weight in found.Weights)
                 DeliveryException.Require(Math.Abs(weight) <= Largest, "weights must be at most 1e6", name);
@@ -124,8 +124,8 @@ namespace Beam.Relightable {
             return bytes;
         }
 
-        private Plane Decoded(byte[] content, ref int at, int size) {
-            var plane = new Plane { Offset = used, Kind = size < 0 ? 0 : Width(size) };
+        private BlockPlane Decoded(byte[] content, ref int at, int size) {
+            var plane = new BlockPlane { Offset = used, Kind = size < 0 ? 0 : Width(size) };
             int orders = Math.Abs(size), sum = 0;
             var sums = new float[size < 0 ? Count : 0];
             for (int i = 0; i < Count; i++) {

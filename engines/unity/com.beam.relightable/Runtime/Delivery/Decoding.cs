@@ -9,7 +9,7 @@ namespace Beam.Relightable {
         public static Dictionary<string, float[]> Frame(this Container take, Block segment, int frame) {
             var found = new Dictionary<string, float[]>();
             foreach (Block block in new[] { take.Still, segment })
-                foreach (KeyValuePair<string, Component[]> pair in block.Arrays) {
+                foreach (KeyValuePair<string, BlockComponent[]> pair in block.Arrays) {
                     if (!found.ContainsKey(pair.Key)) found[pair.Key] = new float[pair.Value.Length * take.Count];
                     block.AddTo(found[pair.Key], pair.Key, block == segment ? frame : 0);
                 }

@@ -34,9 +34,9 @@ namespace Beam.Relightable {
         }
 
         private void Add(Block block, uint buffer, string name, int c, int frame, float share, int row) {
-            Component[] components;
+            BlockComponent[] components;
             if (!block.Arrays.TryGetValue(name, out components)) return;
-            Component each = components[c];
+            BlockComponent each = components[c];
             Ranges[row] += share * each.Weights[frame * each.Columns];
             for (int k = 1; k < each.Columns; k++) {
                 float weight = share * each.Weights[frame * each.Columns + k];

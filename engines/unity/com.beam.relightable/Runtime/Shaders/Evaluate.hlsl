@@ -8,19 +8,19 @@ StructuredBuffer<float4> _BeamComponents; // of each of 21 components: sum of of
 RWStructuredBuffer<float4> _BeamEvaluated; // five rows a Gaussian
 float4 _BeamCounts; // Gaussians
 
-uint word(uint buffer, uint at)
+uint word(uint block, uint at)
 {
-    if (buffer == 0u)
+    if (block == 0u)
         return _BeamStill.Load(at);
-    return buffer == 1u ? _BeamSegment.Load(at) : _BeamNext.Load(at);
+    return block == 1u ? _BeamSegment.Load(at) : _BeamNext.Load(at);
 }
 
 /// Number i of a plane: a float, or an integer of 1, 2 or 4 bytes.
-float numberAt(uint buffer, uint plane, uint kind, uint i)
+float numberAt(uint block, uint plane, uint kind, uint i)
 {
     uint bytes = kind == 0u ? 4u : kind;
     uint at = plane + bytes * i;
-    uint found = word(buffer, at & ~3u);
+    uint found = word(block, at & ~3u);
     if (kind == 0u)
         return asfloat(found);
     uint shift = 32u - 8u * bytes;
@@ -62,11 +62,11 @@ void Evaluate(uint3 thread : SV_DispatchThreadID)
     float3 scale = components(9u, i);
     float3 normal = components(18u, i);
     normal /= max(length(normal), 1.0e-12);
-    float3 half = 2.0 * cross(turn.xyz, normal);
+    float3 twice = 2.0 * cross(turn.xyz, normal);
     scale = float3(scale.x < -29.0 ? 0.0 : exp(min(scale.x, 20.0)), scale.y < -29.0 ? 0.0 : exp(min(scale.y, 20.0)), scale.z < -29.0 ? 0.0 : exp(min(scale.z, 20.0)));
     _BeamEvaluated[5u * i] = float4(components(0u, i), saturate(component(12u, i)));
     _BeamEvaluated[5u * i + 1u] = float4(turn.w * q.xyz + q.w * turn.xyz + cross(turn.xyz, q.xyz), turn.w * q.w - dot(turn.xyz, q.xyz));
     _BeamEvaluated[5u * i + 2u] = float4(scale, saturate(component(16u, i)));
     _BeamEvaluated[5u * i + 3u] = float4(saturate(components(13u, i)), saturate(component(17u, i)));
-    _BeamEvaluated[5u * i + 4u] = float4(normal + turn.w * half + cross(turn.xyz, half), 0.0);
+    _BeamEvaluated[5u * i + 4u] = float4(normal + turn.w * twice + cross(turn.xyz, twice), 0.0);
 }

@@ -137,10 +137,10 @@ float2 cornerOf(Splat splat, float2 side)
     float xy = splat.shape.y * xx;
     float yy = splat.shape.y * xy + 1.0 / (splat.shape.z * splat.shape.z);
     float middle = 0.5 * (xx + yy);
-    float half = 0.5 * (xx - yy);
-    float spread = sqrt(half * half + xy * xy);
-    float turn = 0.5 * atan2(xy, half);
-    float2 axis = abs(xy) + abs(half) > 0.0 ? float2(cos(turn), sin(turn)) : float2(1.0, 0.0);
+    float apart = 0.5 * (xx - yy);
+    float spread = sqrt(apart * apart + xy * xy);
+    float turn = 0.5 * atan2(xy, apart);
+    float2 axis = abs(xy) + abs(apart) > 0.0 ? float2(cos(turn), sin(turn)) : float2(1.0, 0.0);
     // the smaller eigenvalue by the determinant: a needle's would cancel
     float large = middle + spread;
     float small = xx / (splat.shape.z * splat.shape.z) / large;
