@@ -47,6 +47,7 @@ def test_every_file_has_its_identity():
     assert len({re.search(r"guid: (\w{32})\n", text)[1] for text in metas.values()}) == len(metas)
 
 
+@pytest.mark.slow
 def test_the_table_of_albedo_is_that_of_the_renderer():
     """``python engines/unity/prefilter.py`` writes it."""
     prefilter = script("prefilter")
@@ -54,6 +55,7 @@ def test_the_table_of_albedo_is_that_of_the_renderer():
     np.testing.assert_allclose(found, np.frombuffer(prefilter.albedo_bytes(), "<f4"), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_environment_is_written_as_the_package_reads_it():
     content = script("prefilter").prefiltered_bytes(EnvironmentMap.constant((1.0, 2.0, 3.0), height=16))
     rows = np.frombuffer(content, "<i4", 14).astype(int)

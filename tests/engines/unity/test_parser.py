@@ -23,7 +23,9 @@ TAKES = {
 }
 
 
-@pytest.mark.parametrize("name", TAKES)
+@pytest.mark.parametrize(
+    "name", [next(iter(TAKES)), *(pytest.param(name, marks=pytest.mark.slow) for name in list(TAKES)[1:])]
+)
 def test_the_parser_reads_what_python_reads(dump, tmp_path, name):
     file, make, options = TAKES[name]
     take = tmp_path / "take" / file
@@ -100,7 +102,9 @@ def sound(tmp_path_factory):
     return take.read_bytes()
 
 
-@pytest.mark.parametrize("name", DAMAGES)
+@pytest.mark.parametrize(
+    "name", [*list(DAMAGES)[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in list(DAMAGES)[2:])]
+)
 def test_a_damaged_take_is_refused_in_one_line(dump, sound, tmp_path, name):
     take = tmp_path / "a.b4d"
     take.write_bytes(sound)
@@ -112,6 +116,7 @@ def test_a_damaged_take_is_refused_in_one_line(dump, sound, tmp_path, name):
     assert re.match(said, done.stdout), done.stdout
 
 
+@pytest.mark.slow
 def test_segments_are_streamed_and_two_are_held(dump, sound, tmp_path):
     take = tmp_path / "a.b4d"
     take.write_bytes(sound)
@@ -119,6 +124,7 @@ def test_segments_are_streamed_and_two_are_held(dump, sound, tmp_path):
     assert done.stdout.split("\n")[:-1] == ["True True "] * 2, done.stderr
 
 
+@pytest.mark.slow
 def test_a_lost_segment_is_named_while_others_are_streamed(dump, sound, tmp_path):
     take = tmp_path / "a.b4d"
     take.write_bytes(sound)
@@ -128,6 +134,7 @@ def test_a_lost_segment_is_named_while_others_are_streamed(dump, sound, tmp_path
     assert second.startswith("False True 000012.bin must have the digest")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", ["rdf", "rfu", "luf"])
 def test_a_ply_with_materials_is_read_as_python_reads_it(dump, tmp_path, axes):
     path = tmp_path / "a.ply"
@@ -152,6 +159,7 @@ def covariances(orientations, scales):
     return axes @ axes.transpose(0, 2, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [

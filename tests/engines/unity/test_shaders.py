@@ -41,6 +41,7 @@ VARIANTS = [
 ]
 
 
+@pytest.mark.slow
 def test_every_entry_compiles_and_validates():
     for file, entry, defines in VARIANTS:
         found = compiled(file, entry, *defines)

@@ -113,8 +113,15 @@ namespace Beam.Relightable {
         }
 
         private EnvironmentBuffers Environment() {
-            if (prefiltered != null) return EnvironmentBuffers.OfFile(prefiltered.bytes, prefiltered.name);
-            return EnvironmentBuffers.OfCube(cube != null ? cube : ReflectionProbe.defaultTexture, RenderSettings.reflectionIntensity);
+            if (prefiltered != null) {
+                try {
+                    return EnvironmentBuffers.OfFile(prefiltered.bytes, prefiltered.name);
+                } catch (DeliveryException error) {
+                    Debug.LogError("Relightable stage " + name + ": " + error.Message, this);
+                }
+            }
+            Texture light = cube != null ? cube : ReflectionProbe.defaultTexture;
+            return EnvironmentBuffers.OfCube(light != null ? light : CoreUtils.blackCubeTexture, RenderSettings.reflectionIntensity);
         }
 
         private static Vector4 Around() {

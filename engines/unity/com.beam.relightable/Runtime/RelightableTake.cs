@@ -39,7 +39,7 @@ namespace Beam.Relightable {
         public TakeBuffers Buffers { get; private set; }
 
         /// <summary>Whether there is something to draw.</summary>
-        public bool IsReady => Buffers != null && shown >= 0f;
+        public bool IsReady => Buffers != null && Buffers.Count > 0 && shown >= 0f;
 
         /// <summary>From the take's axes (x right, y up, z back) to the renderer's world (x right, y forward, z up).</summary>
         public Matrix4x4 ToWorld => Axes.Swap * transform.localToWorldMatrix * Matrix4x4.Scale(new Vector3(1f, 1f, -1f));
@@ -67,7 +67,7 @@ namespace Beam.Relightable {
             if (opened == null || Buffers == null) return;
             if (isPlaying && Application.isPlaying) time += rate * Time.deltaTime;
             float moment = MomentAt(time);
-            if (moment != shown && container != null) Show(moment);
+            if (moment != shown && container != null && container.Count > 0) Show(moment);
             if (castShadows && IsReady) Cast();
         }
 

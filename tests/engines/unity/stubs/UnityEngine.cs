@@ -256,6 +256,7 @@ namespace UnityEngine.Rendering {
     public struct ScriptableRenderContext { public void ExecuteCommandBuffer(CommandBuffer commands) { } }
     public static class RenderPipelineManager { public static event Action<ScriptableRenderContext, List<Camera>> beginContextRendering; }
     public static class CoreUtils {
+        public static Texture blackCubeTexture;
         public static void Destroy(Object each) { }
         public static void SetKeyword(Material material, string keyword, bool isOn) { }
     }
