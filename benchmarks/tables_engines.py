@@ -6,7 +6,7 @@ from typing import Any
 
 from tables import Row, Rows, cell, table
 
-ENGINES = "engines_cpu.json"
+ENGINES = "engine_shading_cpu.json"
 
 
 @table("engine_shading", ENGINES)

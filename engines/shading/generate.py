@@ -190,7 +190,7 @@ def files(compiler: Path) -> dict[Path, str]:
 
 def main() -> int:
     """Write the files, or say which differ; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--slangc", type=Path, default=slangc(), help="by default that of the package slangtorch")
     parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 if a file differs")
     arguments = parser.parse_args()

@@ -43,7 +43,7 @@ def evaluate(made, which, a, b):
     rows = np.zeros((2 * len(a) + 1, 4), np.float32)
     rows[0, 3] = which
     rows[1::2], rows[2::2] = a, b
-    return made.run(rows, len(a)).astype(np.float64)
+    return made(rows, len(a)).astype(np.float64)
 
 
 def unit(v):
@@ -155,5 +155,5 @@ def cases(name):
 @pytest.mark.parametrize("ready", ["shadedPixel"], indirect=True)
 @pytest.mark.parametrize("name", PROBES)
 def test_pictures_are_those_of_the_deferred_renderer(ready, name):
-    found = {golden.lighting: psnr(ready.run(rows, SIDE * SIDE), golden) for golden, rows in cases(name)}
+    found = {golden.lighting: psnr(ready(rows, SIDE * SIDE), golden) for golden, rows in cases(name)}
     assert min(found.values()) > ENOUGH, found

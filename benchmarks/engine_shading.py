@@ -1,6 +1,6 @@
 """Pictures by the shading source of engines against the deferred renderer, in every language and on every probe.
 
-    python benchmarks/engines.py --out result.json [--picture docs/images/engine_probes.png]
+    python benchmarks/engine_shading.py --out result.json [--picture docs/images/engine_probes.png]
 
 Probes and lights are those of ``tests/engines/probes.py``. The generated texts are run as they are committed: WGSL and
 HLSL on Vulkan, GLSL ES 3.00 in a headless browser, on the processor where there is no GPU. Each shades the G-buffer
@@ -29,7 +29,7 @@ from beam_warp.image.tone import display_over
 
 TARGETS = ("wgsl", "hlsl", "glsl")
 BEHIND = (0.25, 0.25, 0.25)
-COLORS = 128
+COLORS = 255
 """Colours of the picture's palette."""
 
 
@@ -51,7 +51,7 @@ def main() -> int:
             continue
         with tempfile.TemporaryDirectory() as folder, program(target, "shadedPixel", Path(folder)) as made:
             for row, case in zip(rows, cases, strict=True):
-                row["psnr"][target] = psnr(made.run(packed(case), SIDE * SIDE), case)
+                row["psnr"][target] = psnr(made(packed(case), SIDE * SIDE), case)
                 print(f"{target} {row['name']}: {row['psnr'][target]:.1f} dB", flush=True)
     record.write_result(args, wp.get_device("cpu"), {"side": SIDE, "absent": absent, "rows": rows})
     if args.picture:
