@@ -51,7 +51,7 @@ def sort(device, count, position, way):
     device.held["_BeamOrder"] = device.held["_BeamOrdered"]
 
 
-def set_view(device, camera, near=0.01):
+def set_view(device, camera, near=0.01, low_pass=0.3, antialiased=False):
     """Set one eye; the depth buffer holds near / depth."""
     pose = camera.camera_to_world
     rows = np.zeros((2, 4, 4))
@@ -61,7 +61,7 @@ def set_view(device, camera, near=0.01):
         _BeamLens=np.tile([camera.focal_x, camera.focal_y, camera.center_x, camera.center_y], (2, 1)),
         _BeamDepths=np.tile([0.0, near, -1.0, 0.0], (2, 1)),
         _BeamTarget=[camera.width, camera.height, 1.0, near],
-        _BeamFilter=[0.3, 0.0, 0.0, 0.0],
+        _BeamFilter=[low_pass, float(antialiased), 0.0, 0.0],
     )
 
 
@@ -84,7 +84,7 @@ def draw_shadow_maps(device, cloud, maps):
     for layer, view in enumerate(maps.views):
         camera, pose = view.camera, view.camera.camera_to_world
         sort(device, len(cloud), camera.position, camera.forward)
-        set_view(device, camera)
+        set_view(device, camera, 0.01, 0.1, True)  # as the deferred renderer draws its maps
         device.draw(
             "Splats.hlsl",
             ("SplatVertex", "SplatFragment"),

@@ -14,7 +14,7 @@ from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
 pytestmark = [needs_mono, pytest.mark.slow]
 
 SWAP = np.eye(4)[[0, 2, 1, 3]]
-"""From the world of the renderer, x right, y forward, z up, to that of Unity, x right, y up, z forward, and back."""
+"""The way from the renderer's world, x right, y forward, z up, to Unity's, x right, y up, z forward, and back."""
 
 CASTERS = ShadowCasters(np.array([0.2, 0.3, 0.9]), 1.1, 0.01)
 LIGHTS = [

@@ -143,7 +143,7 @@ def test_pictures_are_those_of_the_deferred_renderer(name):
 
 @pytest.mark.slow
 def test_a_take_is_turned_with_its_object():
-    """From a container's axes, x right, y up, z back, turned by a matrix: the same picture."""
+    """Gaussians in a container's axes, x right, y up, z back, and a matrix give the same picture."""
     (golden,) = goldens(["tripod"], ["studio"])
     to_world = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     assert close_to(golden, picture(Device(), golden, change_axes(golden.shot.cloud, "rub"), to_world))
@@ -155,13 +155,13 @@ def test_opaque_surfaces_hide_splats_behind_them():
     cloud, camera = golden.shot.cloud, golden.shot.camera
     device = Device()
     upload_gaussians(device, cloud)
-    wall = 2.6  # between the balls
+    wall = 2.7  # between the balls
     draw_buffer(device, cloud, camera, scene_depth=0.01 / wall)
     rest = device.image("_BeamRest")
     covered = rest[..., 3] > 0.0
     depth = rest[covered, 2] / rest[covered, 3]
     assert (depth < wall + 1e-4).all()
-    behind = (golden.frame.image().layers["depth"] > wall + 0.3) & (golden.image.alpha > 0.9)
+    behind = (golden.frame.image().layers["depth"] > wall + 0.2) & (golden.image.alpha > 0.9)
     assert behind.any()
     assert not covered[behind].any()
 

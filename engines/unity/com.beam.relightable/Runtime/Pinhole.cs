@@ -45,8 +45,8 @@ namespace Beam.Relightable {
             };
         }
 
-        /// <summary>Make shaders draw these eyes: one, or two of single-pass stereo.</summary>
-        public static void Set(CommandBuffer commands, Pinhole first, Pinhole second, float near, TakeAsset asset) {
+        /// <summary>Make shaders draw these eyes, one, or two of single-pass stereo, through a low-pass of that variance [pixel²].</summary>
+        public static void Set(CommandBuffer commands, Pinhole first, Pinhole second, float near, float lowPass, bool isAntialiased) {
             for (int eye = 0; eye < 2; eye++) {
                 Pinhole view = eye == 0 ? first : second;
                 Cameras[eye].SetRow(0, view.position);
@@ -61,7 +61,7 @@ namespace Beam.Relightable {
             commands.SetGlobalVectorArray("_BeamDepths", Depths);
             float flip = SystemInfo.graphicsUVStartsAtTop ? 1f : -1f;
             commands.SetGlobalVector("_BeamTarget", new Vector4(first.size.x, first.size.y, flip, near));
-            commands.SetGlobalVector("_BeamFilter", new Vector4(asset == null ? 0.3f : asset.lowPass, asset != null && asset.antialiased ? 1f : 0f, 0f, 0f));
+            commands.SetGlobalVector("_BeamFilter", new Vector4(lowPass, isAntialiased ? 1f : 0f, 0f, 0f));
         }
     }
 }

@@ -63,7 +63,7 @@ namespace Beam.Relightable {
             Allocate(size, eyes);
             foreach (RelightableTake take in FarthestFirst(first)) {
                 take.Buffers.Sort(commands, take.ToWorld, 0.5f * (first.position + second.position), first.forward);
-                Pinhole.Set(commands, first, second, Mathf.Max(camera.nearClipPlane, 0.01f), take.asset);
+                Pinhole.Set(commands, first, second, Mathf.Max(camera.nearClipPlane, 0.01f), take.asset.lowPass, take.asset.antialiased);
                 commands.SetRenderTarget(targets, BuiltinRenderTextureType.None, 0, CubemapFace.Unknown, AllSlices);
                 commands.ClearRenderTarget(false, true, Color.clear);
                 DrawSplats(commands, take, material, SplatPass);

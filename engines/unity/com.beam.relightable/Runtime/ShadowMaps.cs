@@ -8,7 +8,7 @@ namespace Beam.Relightable {
     /// <summary>Lamps of a stage as shaders read them, and their shadow maps of takes and chosen meshes.</summary>
     /// <remarks>Where maps look from is that of beam_warp/render/shadow_maps.py.</remarks>
     public sealed class ShadowMaps : IDisposable {
-        private const float Far = 500f, Room = 1.06f, Near = 0.02f, Widest = 60f, FaceAngle = 48f, LargestKernel = 0.25f, Thickest = 0.02f;
+        private const float Far = 500f, Room = 1.06f, Near = 0.02f, Widest = 60f, FaceAngle = 48f, LargestKernel = 0.25f, Thickest = 0.02f, LowPass = 0.1f;
         private const int MostMaps = 64, MapRows = 6, LampRows = 4;
         private readonly List<Vector4> lamps = new List<Vector4>(), rows = new List<Vector4>();
         private readonly List<Pinhole> views = new List<Pinhole>();
@@ -35,12 +35,12 @@ namespace Beam.Relightable {
                 commands.ClearRenderTarget(false, true, Color.clear);
                 foreach (RelightableTake take in RelightPass.FarthestFirst(views[map])) {
                     take.Buffers.Sort(commands, take.ToWorld, views[map].position, views[map].forward);
-                    Pinhole.Set(commands, views[map], views[map], Near, take.asset);
+                    Pinhole.Set(commands, views[map], views[map], Near, LowPass, true);
                     RelightPass.DrawSplats(commands, take, material, RelightPass.ShadowPass);
                 }
                 commands.SetRenderTarget(meshes, BuiltinRenderTextureType.None, 0, CubemapFace.Unknown, map);
                 commands.ClearRenderTarget(false, true, new Color(3e38f, 0f, 0f, 0f));
-                Pinhole.Set(commands, views[map], views[map], Near, null);
+                Pinhole.Set(commands, views[map], views[map], Near, LowPass, true);
                 foreach (Renderer caster in stage.casters)
                     for (int part = 0; caster != null && caster.enabled && part < caster.sharedMaterials.Length; part++)
                         commands.DrawRenderer(caster, material, part, RelightPass.MeshPass);

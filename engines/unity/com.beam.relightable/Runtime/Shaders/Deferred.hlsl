@@ -8,7 +8,7 @@ Texture2DArray<float4> _BeamNormal;
 Texture2DArray<float4> _BeamRest;
 Texture2DArray<float4> _BeamFirst;
 Texture2DArray<float4> _BeamShadowSums; // of Gaussians: depth times alpha, alpha in z and w
-Texture2DArray<float4> _BeamShadowFirst; // depth of the nearest splat that hides half [m], 0 for none
+Texture2DArray<float4> _BeamShadowFirst; // depth of the nearest splat that hides a quarter [m], 0 for none
 Texture2DArray<float4> _BeamShadowMeshes; // depth of triangles [m]; where there are none, a great one
 StructuredBuffer<float4> _BeamEnvironment; // texels of all levels, and irradiance
 StructuredBuffer<float4> _BeamAlbedo; // (A, B), 64 x 64

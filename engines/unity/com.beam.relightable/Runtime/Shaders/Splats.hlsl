@@ -11,6 +11,10 @@ Texture2DArray<float4> _CameraDepthTexture;
 Texture2D<float4> _CameraDepthTexture;
 #endif
 
+/// Alpha from which on a splat counts as what is first. Splats of a surface overlap, so that the one by which a half is hidden,
+/// whose depth is the median, comes soon after the first that hides a quarter. Blending knows no sum of those before.
+static const float HIDING = 0.25;
+
 struct SplatCorner
 {
     float4 clip : SV_Position;
@@ -28,7 +32,7 @@ struct Sums
     float4 look : SV_Target0; // base colour, alpha
     float4 normal : SV_Target1; // normal, alpha
     float4 rest : SV_Target2; // roughness, ambient occlusion, depth, alpha
-    float4 first : SV_Target3; // depth of the nearest splat that hides half: blended as if it hid all
+    float4 first : SV_Target3; // depth of the nearest splat of HIDING: blended as if it hid all
 };
 
 SplatCorner SplatVertex(uint vertex : SV_VertexID BEAM_EYE_INPUT)
@@ -65,7 +69,7 @@ Splat splatOf(SplatCorner input)
 struct ShadowSums
 {
     float4 mean : SV_Target0; // depth in z, alpha
-    float4 first : SV_Target1; // depth of the nearest splat that hides half: blended as if it hid all
+    float4 first : SV_Target1; // depth of the nearest splat of HIDING: blended as if it hid all
 };
 
 ShadowSums SplatFragment(SplatCorner input)
@@ -75,7 +79,7 @@ ShadowSums SplatFragment(SplatCorner input)
     if (!(alpha > 0.0))
         discard;
     float depth = depthAt(splat, input.offset, _BeamTarget.w);
-    float hides = alpha >= 0.5 ? 1.0 : 0.0;
+    float hides = alpha >= HIDING ? 1.0 : 0.0;
     ShadowSums sums;
     sums.mean = float4(0.0, 0.0, depth * alpha, alpha);
     sums.first = float4(depth * hides, 0.0, 0.0, hides);
@@ -102,7 +106,7 @@ Sums SplatFragment(SplatCorner input)
     Sums sums;
     sums.look = float4(input.look.xyz * alpha, alpha);
     sums.normal = float4(input.normal.xyz * alpha, alpha);
-    float hides = alpha >= 0.5 ? 1.0 : 0.0;
+    float hides = alpha >= HIDING ? 1.0 : 0.0;
     sums.first = float4(depth * hides, 0.0, 0.0, hides);
     sums.rest = float4(input.look.w * alpha, input.normal.w * alpha, depth * alpha, alpha);
     return sums;
