@@ -1,0 +1,1 @@
+// Caster.hlsl takes nothing of it; what HDRP has stands beside.
