@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,9 @@ TIME_MARGIN = 1.3
 ERROR_MARGIN = 1.1
 """A job may err by this many times what its pilot predicts: other frames, other pixels, other samples."""
 
+GROWTH = 3.0
+"""The next rung of a ladder may take this many times as long to measure as the last one."""
+
 DIGITS = 2
 """Digits of what is offered instead of a target that cannot be reached."""
 
@@ -35,19 +38,29 @@ class Rung:
 
     Attributes:
         settings: The setting.
-        seconds: Time of the whole job, what was spent on the pilot included [s].
-        frame_seconds: Time of one more frame [s].
-        error: Error of the result, in the command's own unit.
+        seconds: Time of the job [s].
+        frame_seconds: Time of a frame [s].
+        error: Error of the result, in the command's own unit; NaN where it is not known.
+        spent: Time that was spent before the job, on the pilot above all [s].
     """
 
     settings: Settings
     seconds: float
     frame_seconds: float
-    error: float
+    error: float = math.nan
+    spent: float = 0.0
 
-    def predicted(self) -> dict[str, float]:
-        """Return what is predicted, by the names of a target."""
-        return {"error": self.error, "seconds": self.seconds, "fps": 1.0 / max(self.frame_seconds, 1e-12)}
+    def predicted(self, *, time_margin: float = 1.0, error_margin: float = 1.0) -> dict[str, float]:
+        """Return what is predicted, by the names of a target, times margins."""
+        return {
+            "error": error_margin * self.error,
+            "seconds": self.spent + time_margin * self.seconds,
+            "fps": 1.0 / max(time_margin * self.frame_seconds, 1e-12),
+        }
+
+    def surely(self) -> dict[str, float]:
+        """Return what is predicted with a margin."""
+        return self.predicted(time_margin=TIME_MARGIN, error_margin=ERROR_MARGIN)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,41 +97,30 @@ class Target:
 
     def meets(self, rung: Rung) -> bool:
         """Return whether a rung is predicted to meet the target, with a margin."""
-        return self.excess(_with_margins(rung)) <= 1.0
-
-    def met(self, found: Mapping[str, float]) -> bool:
-        """Return whether what was reached meets the target."""
-        return self.excess(found) <= 1.0
-
-
-def _with_margins(rung: Rung) -> dict[str, float]:
-    said = rung.predicted()
-    return {
-        "error": ERROR_MARGIN * said["error"],
-        "seconds": TIME_MARGIN * said["seconds"],
-        "fps": said["fps"] / TIME_MARGIN,
-    }
+        return self.excess(rung.surely()) <= 1.0
 
 
 def cheapest(rungs: Sequence[Rung], target: Target) -> Rung:
     """Return the cheapest rung that meets a target; where no error is asked, the most exact that meets the others.
 
-    So a looser error never costs more, and a longer time never errs more.
+    So a looser error never costs more, and a longer time never errs more. Where errors are not known, what costs more
+    is taken for more exact.
 
     Raises:
         InvalidOptionError: None meets it; the message has the nearest target that one does.
     """
     meeting = [rung for rung in rungs if target.meets(rung)]
     if not meeting:
-        raise unattainable(min(rungs, key=lambda rung: target.excess(_with_margins(rung))), target)
+        raise unattainable(min(rungs, key=lambda rung: target.excess(rung.surely())), target)
     if target.error is None:
-        return min(meeting, key=lambda rung: (rung.error, rung.seconds))
+        known = not any(math.isnan(rung.error) for rung in rungs)
+        return min(meeting, key=lambda rung: (rung.error, rung.seconds) if known else (-rung.seconds, 0.0))
     return min(meeting, key=lambda rung: (rung.seconds, rung.error))
 
 
 def unattainable(nearest: Rung, target: Target) -> InvalidOptionError:
     """Return the refusal of a target, with what can be asked instead: what the nearest rung surely reaches."""
-    asked, sure = target.asked(), _with_margins(nearest)
+    asked, sure = target.asked(), nearest.surely()
     offered = {
         name: value if target.excess({**asked, name: sure[name]}) <= 1.0 else _rounded(sure[name], up=name != "fps")
         for name, value in asked.items()
@@ -142,23 +144,36 @@ def _rounded(value: float, *, up: bool) -> float:
     return float(f"{(math.ceil if up else math.floor)(value / step) * step:.12g}") if math.isfinite(value) else value
 
 
-def climbed(ladder: Iterable[Settings], measure: Callable[[Settings], Rung], target: Target) -> list[Rung]:
-    """Measure a ladder from its cheapest setting up, as far as a target needs.
+def climbed(
+    ladder: Iterable[Settings],
+    measure: Callable[[Settings], Rung],
+    target: Target,
+    elapsed: Callable[[], float] = lambda: 0.0,
+) -> list[Rung]:
+    """Measure a ladder from its cheapest setting up, as far as a target needs and its time allows.
 
-    The climb ends at the first rung that meets the target if an error is asked, and at one that takes too long.
+    The climb ends at the first rung that meets the target if an error is asked, at one that takes too long, and where
+    measuring another would leave too little time for the quickest.
 
     Args:
         ladder: Settings, the cheapest first.
         measure: Measures one.
         target: What is asked.
+        elapsed: Returns the time since the command began [s].
     """
     others = Target(seconds=target.seconds, fps=target.fps)
     found: list[Rung] = []
     for settings in ladder:
+        before = elapsed()
         found.append(measure(settings))
-        if not others.meets(found[-1]) or (target.error is not None and target.meets(found[-1])):
+        now = elapsed()
+        last, quickest = replace(found[-1], spent=now), min(rung.seconds for rung in found)
+        if not others.meets(last) or (target.error is not None and target.meets(last)):
             break
-    return found
+        if target.seconds is not None and now + GROWTH * (now - before) + TIME_MARGIN * quickest > target.seconds:
+            break
+    spent = elapsed()
+    return [replace(rung, spent=spent) for rung in found]
 
 
 def fitted(features: ArrayLike, values: ArrayLike) -> NDArray[np.float64]:
@@ -190,7 +205,7 @@ def outcome(target: Target, chosen: Rung, reached: Mapping[str, float | None]) -
         "chosen": dict(chosen.settings),
         "predicted": {name: value if math.isfinite(value) else None for name, value in predicted.items()},
         "reached": {name: reached.get(name) for name in predicted},
-        "met": target.met({name: float(value) for name, value in known.items() if value is not None}),
+        "met": target.excess({name: float(value) for name, value in known.items() if value is not None}) <= 1.0,
     }
 
 

@@ -8,7 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.study.targets import ERROR_MARGIN, TIME_MARGIN, Rung, Target, cheapest, climbed, fitted, in_words, outcome
+from beam_warp.study.targets import (
+    ERROR_MARGIN,
+    TIME_MARGIN,
+    Rung,
+    Target,
+    cheapest,
+    climbed,
+    fitted,
+    in_words,
+    outcome,
+)
 
 
 def rung(rays, seconds=None, error=None):
@@ -91,6 +101,17 @@ def test_a_climb_ends_where_the_target_is_met_or_time_is_up():
     measured.clear()
     assert len(climbed(ladder, measure, Target(seconds=4.0))) == 4  # 256 rays take too long
     assert len(climbed(ladder, measure, Target(error=1e-6))) == 6
+    clock = iter(range(0, 1000, 5))  # measuring takes 5 s, and the next rung perhaps 15
+    found = climbed(ladder, measure, Target(seconds=30.0), lambda: next(clock))
+    assert [each.settings["samples"] for each in found] == [4, 16]
+    assert found[0].spent == found[1].spent == 20.0
+
+
+def test_without_known_errors_the_costliest_that_fits_is_taken():
+    unknown = [rung(4**k, error=math.nan) for k in range(1, 7)]
+    assert cheapest(unknown, Target(seconds=4.0)).settings == {"samples": 64}
+    with pytest.raises(InvalidOptionError):
+        cheapest(unknown, Target(error=1.0))
 
 
 def test_models_are_found_again():
