@@ -7,6 +7,7 @@ traced at these pixels, in two halves whose difference tells its own noise.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isqrt
 from typing import Any
@@ -19,6 +20,7 @@ from beam_warp._version import __version__
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import linear_to_srgb
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import UNSHADOWED, DeferredOptions
@@ -131,32 +133,39 @@ def noise_of(image: RenderedImage, pixels: NDArray[np.int64] | None = None) -> f
 
 
 def deferred_frame(
-    shot: Shot, options: DeferredOptions, raster: RasterOptions, device: Any, repeats: int = 1
+    shot: Shot,
+    options: DeferredOptions,
+    raster: RasterOptions,
+    device: Any,
+    repeats: int = 1,
+    prepared: Sequence[PreparedEnvironment] = (),
 ) -> tuple[RenderedImage, list[float]]:
-    """Draw a shot by deferred shading; return the image, and times of a frame of which everything is redrawn [s]."""
-    renderer, seconds = DeferredRenderer(options, raster=raster, device=device), list[float]()
-    image = renderer.draw(shot)  # compiles, and prepares the environment
-    for _ in range(repeats):
+    """Draw a shot by deferred shading; return the image, and times of frames of which everything is redrawn [s].
+
+    The first time, which comes before those of the repeats, is that of a first frame: kernels may be compiled in it,
+    and an environment that is not prepared yet is.
+    """
+    renderer = DeferredRenderer(options, raster=raster, device=device, prepared=prepared)
+    seconds, image = list[float](), None
+    for _ in range(repeats + 1):
         moved = replace(shot, cloud=shot.cloud.with_arrays())
         wp.synchronize_device(device)
         started = time.perf_counter()
         image = renderer.draw(moved)
         seconds.append(time.perf_counter() - started)
+    assert image is not None
     return image, seconds
 
 
 def path_frame(
-    true: TruePixels, samples: int, bounces: int, device: Any, repeats: int = 1
+    shot: Shot, pixels: NDArray[np.int64], covered: int, samples: int, bounces: int, device: Any, repeats: int = 1
 ) -> tuple[RenderedImage, list[float]]:
-    """Path trace the pixels whose truth is known; return the image, and times scaled to all that are covered [s]."""
-    seconds, image = list[float](), RenderedImage(*(np.zeros(0, np.float32) for _ in range(2)))
-    traced_pixels(true.shot, true.pixels[:8], PathOptions(samples=4, bounces=bounces), device)  # compiles
+    """Path trace some of the pixels that are covered; return the image, and times scaled to all of them [s]."""
+    seconds, image = list[float](), traced_pixels(shot, pixels[:8], PathOptions(samples=4, bounces=bounces), device)
     for repeat in range(repeats):
         started = time.perf_counter()
-        image = traced_pixels(
-            true.shot, true.pixels, PathOptions(samples=samples, bounces=bounces, seed=repeat), device
-        )
-        seconds.append((time.perf_counter() - started) * true.covered / len(true.pixels))
+        image = traced_pixels(shot, pixels, PathOptions(samples=samples, bounces=bounces, seed=repeat), device)
+        seconds.append((time.perf_counter() - started) * covered / len(pixels))
     return image, seconds
 
 
@@ -227,7 +236,7 @@ def relighting_study(
     def measure(settings: Settings) -> Row:
         samples = int(settings["samples"])
         if settings["renderer"] == "path":
-            image, seconds = path_frame(true, samples, TRUE_BOUNCES, target, repeats)
+            image, seconds = path_frame(shot, true.pixels, true.covered, samples, TRUE_BOUNCES, target, repeats)
         else:
             options = DeferredOptions(
                 samples=isqrt(samples),
@@ -236,7 +245,7 @@ def relighting_study(
                 bounces=int(settings["bounces"]),
                 layers=(),
             )
-            image, seconds = deferred_frame(shot, options, raster, target, repeats)
+            image, (_, *seconds) = deferred_frame(shot, options, raster, target, repeats)
         return Row(settings, Interval.of_median(seconds), {ERROR: true.error(image)})
 
     return Study(subject, _plan(), measure, _work)

@@ -28,6 +28,12 @@ ERROR_MARGIN = 1.1
 GROWTH = 3.0
 """The next rung of a ladder may take this many times as long to measure as the last one."""
 
+PILOT_PART = 0.4
+"""Part of the time asked for that a pilot may take where no error is asked."""
+
+MET = 1.0 + 1e-9
+"""Ratio of what is reached to what is asked that still counts as met: offers are rounded numbers."""
+
 DIGITS = 2
 """Digits of what is offered instead of a target that cannot be reached."""
 
@@ -97,14 +103,14 @@ class Target:
 
     def meets(self, rung: Rung) -> bool:
         """Return whether a rung is predicted to meet the target, with a margin."""
-        return self.excess(rung.surely()) <= 1.0
+        return self.excess(rung.surely()) <= MET
 
 
 def cheapest(rungs: Sequence[Rung], target: Target) -> Rung:
     """Return the cheapest rung that meets a target; where no error is asked, the most exact that meets the others.
 
-    So a looser error never costs more, and a longer time never errs more. Where errors are not known, what costs more
-    is taken for more exact.
+    So a looser error never costs more, and a longer time never errs more. Where errors are not known, the last rung
+    is taken for the most exact.
 
     Raises:
         InvalidOptionError: None meets it; the message has the nearest target that one does.
@@ -114,7 +120,7 @@ def cheapest(rungs: Sequence[Rung], target: Target) -> Rung:
         raise unattainable(min(rungs, key=lambda rung: target.excess(rung.surely())), target)
     if target.error is None:
         known = not any(math.isnan(rung.error) for rung in rungs)
-        return min(meeting, key=lambda rung: (rung.error, rung.seconds) if known else (-rung.seconds, 0.0))
+        return min(meeting, key=lambda rung: (rung.error, rung.seconds)) if known else meeting[-1]
     return min(meeting, key=lambda rung: (rung.seconds, rung.error))
 
 
@@ -122,7 +128,7 @@ def unattainable(nearest: Rung, target: Target) -> InvalidOptionError:
     """Return the refusal of a target, with what can be asked instead: what the nearest rung surely reaches."""
     asked, sure = target.asked(), nearest.surely()
     offered = {
-        name: value if target.excess({**asked, name: sure[name]}) <= 1.0 else _rounded(sure[name], up=name != "fps")
+        name: value if target.excess({**asked, name: sure[name]}) <= MET else _rounded(sure[name], up=name != "fps")
         for name, value in asked.items()
     }
     names = " and ".join(f"target-{name}" for name in asked)
@@ -153,7 +159,7 @@ def climbed(
     """Measure a ladder from its cheapest setting up, as far as a target needs and its time allows.
 
     The climb ends at the first rung that meets the target if an error is asked, at one that takes too long, and where
-    measuring another would leave too little time for the quickest.
+    measuring another would take more than a pilot's part of the time, or with an error, more than there is.
 
     Args:
         ladder: Settings, the cheapest first.
@@ -167,10 +173,11 @@ def climbed(
         before = elapsed()
         found.append(measure(settings))
         now = elapsed()
-        last, quickest = replace(found[-1], spent=now), min(rung.seconds for rung in found)
+        last = replace(found[-1], spent=now)
         if not others.meets(last) or (target.error is not None and target.meets(last)):
             break
-        if target.seconds is not None and now + GROWTH * (now - before) + TIME_MARGIN * quickest > target.seconds:
+        part = PILOT_PART if target.error is None else 1.0
+        if target.seconds is not None and now + GROWTH * (now - before) > part * target.seconds:
             break
     spent = elapsed()
     return [replace(rung, spent=spent) for rung in found]
@@ -205,15 +212,13 @@ def outcome(target: Target, chosen: Rung, reached: Mapping[str, float | None]) -
         "chosen": dict(chosen.settings),
         "predicted": {name: value if math.isfinite(value) else None for name, value in predicted.items()},
         "reached": {name: reached.get(name) for name in predicted},
-        "met": target.excess({name: float(value) for name, value in known.items() if value is not None}) <= 1.0,
+        "met": target.excess({name: float(value) for name, value in known.items() if value is not None}) <= MET,
     }
 
 
 def in_words(said: Mapping[str, Any]) -> str:
     """Return an `outcome` in a line."""
     chosen = ", ".join(f"{name} {level}" for name, level in said["chosen"].items())
-    parts = [
-        f"{name} {asked:g}, reached {'unknown' if said['reached'][name] is None else format(said['reached'][name], '.3g')}"
-        for name, asked in said["asked"].items()
-    ]
+    reached = {name: "unknown" if value is None else f"{value:.3g}" for name, value in said["reached"].items()}
+    parts = [f"{name} {asked:g}, reached {reached[name]}" for name, asked in said["asked"].items()]
     return f"target {'met' if said['met'] else 'MISSED'}: {'; '.join(parts)}, by {chosen}"

@@ -102,7 +102,7 @@ def test_a_climb_ends_where_the_target_is_met_or_time_is_up():
     assert len(climbed(ladder, measure, Target(seconds=4.0))) == 4  # 256 rays take too long
     assert len(climbed(ladder, measure, Target(error=1e-6))) == 6
     clock = iter(range(0, 1000, 5))  # measuring takes 5 s, and the next rung perhaps 15
-    found = climbed(ladder, measure, Target(seconds=30.0), lambda: next(clock))
+    found = climbed(ladder, measure, Target(seconds=60.0), lambda: next(clock))
     assert [each.settings["samples"] for each in found] == [4, 16]
     assert found[0].spent == found[1].spent == 20.0
 

@@ -30,8 +30,8 @@ class TargetFlags:
         float | None,
         arg(
             metavar="E",
-            help="Take the cheapest settings of this error: of base colour (run, decompose), of display values (render), "
-            "of colour in the photographs (reconstruct).",
+            help="Take the cheapest settings of this error: of base colour (run, decompose), of display values "
+            "(render), of colour in the photographs (reconstruct).",
         ),
     ] = None
     target_seconds: Annotated[
