@@ -345,7 +345,7 @@ def _measure_reconstruction(args: ReconstructChart, report: NotedProgress) -> tu
 
     resolve_device(args.device)
     with tempfile.TemporaryDirectory() as folder:
-        capture, name = _capture(args.capture, Path(folder), args.frame, args.device, report, test=2)
+        capture, name = _capture(args.capture, Path(folder), args.frame, args.device, report)
         number = capture.frames[require_count("frame", args.frame, 0, len(capture.frames) - 1)]
         options = {name: getattr(args, name) for name in ("gaussians", "schedules", "shares")}
         study = reconstruction_study(capture, number, name=name, device=args.device, **options)
@@ -473,7 +473,7 @@ def _measure_materials(args: MaterialsChart, report: NotedProgress) -> tuple[Tab
 
 
 def _capture(
-    path: Path | None, folder: Path, frame: int, device: str | None, report: NotedProgress, test: int = 1
+    path: Path | None, folder: Path, frame: int, device: str | None, report: NotedProgress
 ) -> tuple[Capture, str]:
     """Return a capture and what to call it; without one, the built-in figure, written to the folder."""
     from beam_warp.demo.capture import write_demo_capture
@@ -484,7 +484,6 @@ def _capture(
         folder / "capture",
         frame_count=frame + 1,
         camera_count=FIGURE_CAMERAS,
-        test_camera_count=test,
         size=FIGURE_SIZE,
         device=device,
         progress=report,

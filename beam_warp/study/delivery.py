@@ -1,4 +1,4 @@
-"""What the delivery container b4d costs and how far its relit images are from the asset's: a study of ``beam chart``."""
+"""What delivery as b4d costs and how far its relit images are from the asset's: a study of ``beam chart``."""
 
 from __future__ import annotations
 

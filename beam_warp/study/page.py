@@ -54,7 +54,8 @@ def write_page(tables: Sequence[Table], path: Path) -> None:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(tables[0].subject.title)}</title>\n<style>{STYLE}</style>\n"
         f"<script>{get_plotlyjs()}</script>\n</head>\n<body>\n"
-        f'<script type="application/json" id="data">{data}</script>\n<script>function chart(data, root) {{\n{script}}}{EACH}</script>\n</body>\n</html>\n'
+        f'<script type="application/json" id="data">{data}</script>\n'
+        f"<script>function chart(data, root) {{\n{script}}}{EACH}</script>\n</body>\n</html>\n"
     )
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
