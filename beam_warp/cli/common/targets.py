@@ -89,7 +89,7 @@ def chosen_rays(
     more = max(rest[2] - rest[1], 0.0) * (frame_count - 1) if frames == 2 else 0.0
 
     def rung(rays: int) -> Rung:
-        seconds = rest[1] + more + frame_count * traced * max(1.0, rays / PILOT_RAYS[1])
+        seconds = rest[1] + more + frame_count * traced * rays / PILOT_RAYS[1]
         return Rung(
             settings={"samples": rays},
             seconds=seconds,

@@ -29,8 +29,8 @@ DEFERRED_LADDER = ((1, 0, 0), (2, 0, 0), (3, 0, 0), (2, 4, 1), (2, 16, 2), (3, 1
 PATH_PILOTS = (16, 64)
 """Samples of the pixels of a path tracer's pilot."""
 
-PATH_LADDER = tuple(2**power for power in range(2, 17))
-"""Samples a pixel that a target may choose."""
+PATH_LADDER = tuple(2**power for power in range(4, 17))
+"""Samples a pixel that a target may choose: fewer than the pilots' are noisier than these predict."""
 
 
 @dataclass(eq=False)
