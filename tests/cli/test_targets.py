@@ -41,7 +41,8 @@ def said(capsys):
     return json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("command", ["run", pytest.param("decompose", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["run", "decompose"])
 def test_materials(folder, capsys, command):
     out = folder / "out"
     words = (command, folder / "ball.ply", "--environment", folder / "sky.exr", "--out", out, "--device", "cpu")
