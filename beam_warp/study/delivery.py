@@ -80,15 +80,17 @@ def delivery_study(
         return found
 
     originals = images(sequence)
-    truth = f"the asset's own images of {len(shown)} frames under the light and the light turned by 180°"
+    truth = f"the asset's own images of {len(shown)} frame{'s'[: len(shown) > 1]} under the light and the light turned by 180°"
     metrics = [
-        Metric(RELIT, "RMS error of relit images", sentence=f"Against {truth}; display values where they show it.")
+        Metric(
+            RELIT, "RMS error of relit images", sentence=f"Against {truth}; display values; PSNR is -20 log10 of it."
+        )
     ]
     if flip is not None:
         metrics.append(Metric(FLIP, "FLIP of relit images", sentence=f"Against {truth}; mean over images."))
     subject = StudySubject(
         name="delivery",
-        title=f"Error against size of delivery: {name}, {len(sequence)} frames, {len(positions):,} Gaussians",
+        title=f"Error against size of delivery: {name}, {len(positions):,} Gaussians, frames: {len(sequence)}",
         axes=(Axis("scale", "Error scale", tuple(sorted(scales)), sentence="beam-convert --error-scale."),),
         metrics=tuple(metrics),
         cost="Size of a frame",

@@ -207,7 +207,7 @@ def relighting_study(
             Axis("samples", "Samples", tuple(sorted({*DEFERRED_SAMPLES, *PATH_SAMPLES})), "samples", "A pixel's."),
             Axis("renderer", "Renderer", ("deferred", "path"), sentence="As --mode of beam render."),
             Axis("shadows", "Shadows", SHADOWS, sentence="Directions from which the environment casts shadows."),
-            Axis("maps", "Maps", MAPS, "texel", "Side of the environment's shadow maps."),
+            Axis("maps", "Maps", MAPS, "texels", "Side of the environment's shadow maps."),
             Axis("bounces", "Bounces", BOUNCES, sentence="Between surfaces; the path tracer's are the truth's."),
         ),
         metrics=(
