@@ -80,7 +80,7 @@ def delivery_study(
         return found
 
     originals = images(sequence)
-    truth = f"the asset's own images of {len(shown)} frame{'s'[: len(shown) > 1]} under the light and the light turned by 180°"
+    truth = f"the asset's own images under the light and the light turned by 180°, frames: {len(shown)}"
     metrics = [
         Metric(
             RELIT, "RMS error of relit images", sentence=f"Against {truth}; display values; PSNR is -20 log10 of it."
