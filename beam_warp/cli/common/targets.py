@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 from tyro.conf import arg
 
+from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.study.targets import Rung, Target, cheapest, fitted, in_words, outcome
 
 PILOT_RAYS = (16, 64)
@@ -35,10 +36,12 @@ class TargetFlags:
         ),
     ] = None
     target_seconds: Annotated[
-        float | None, arg(metavar="S", help="Take the most exact settings that are done in this time, or see above.")
+        float | None,
+        arg(metavar="S", help="Take the most exact settings that are done in this time; with an error, the cheapest."),
+        SECOND_PAGE,
     ] = None
     target_fps: Annotated[
-        float | None, arg(metavar="F", help="The same for frames a second, without the pilot's time.")
+        float | None, arg(metavar="F", help="The same for frames a second, without the pilot's time."), SECOND_PAGE
     ] = None
 
     @property

@@ -74,7 +74,9 @@ class LightFlags:
     environment: Annotated[
         Path | None, arg(metavar="FILE", help="Lat-long light, .exr or .hdr; by default the capture's or stage's own.")
     ] = None
-    rotate: Annotated[float, arg(metavar="DEG", help="Turn it about z, counter-clockwise from above.")] = 0.0
+    rotate: Annotated[float, arg(metavar="DEG", help="Turn it about z, counter-clockwise from above."), SECOND_PAGE] = (
+        0.0
+    )
     rotate_per_second: Annotated[float, arg(metavar="DEG", help="Go on turning it as the film plays."), SECOND_PAGE] = (
         0.0
     )
