@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from beam_warp import converters
+from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count, require_number, require_package
 from beam_warp.cli.common.console import print_json, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, SourceAxes
@@ -23,9 +24,12 @@ from beam_warp.study.page import write_page
 from beam_warp.study.picture import write_image
 from beam_warp.study.table import Settings, Study, Table, read_table, run_study, table_paths
 from beam_warp.world.axes import change_axes
+from beam_warp.world.camera import MAX_SIDE, Camera
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import numbers_of_frames
 from beam_warp.world.shapes import still_life
+from beam_warp.world.shot import Shot
 
 REFERENCE_PART = 0.35
 """References may take this part of the budget; where they would take longer, fewer points are measured."""
@@ -161,23 +165,154 @@ class MaterialsChart:
 
 
 @dataclass(frozen=True)
+class ChartFlags:
+    """What the other charts share."""
+
+    out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
+    from_csv: Annotated[Path | None, arg(metavar="FILE", help="Draw this table again; measure nothing.")] = None
+    frame: Annotated[int, arg(metavar="N", help="Frame that is measured, counted from 0.")] = 0
+    budget_seconds: Annotated[
+        float, arg(metavar="S", help="Time for measuring; what does not fit is skipped and counted.")
+    ] = 120.0
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class ReconstructChart(ChartFlags):
+    """Measure error against time of reconstructing a key frame: Gaussians, steps and cameras.
+
+    Writes OUT/reconstruct.csv, .png and .html. Errors are those of test cameras, whose photographs are not used, and of
+    normals where the capture has them. Without a capture a small figure is path traced.
+
+    Example: beam chart reconstruct captures/walker --out chart
+    """
+
+    capture: Annotated[
+        Positional[Path | None], arg(metavar="[CAPTURE]", help="Images and cameras; a path-traced figure if none.")
+    ] = None
+    gaussians: Annotated[tuple[int, ...], arg(metavar="N ...", help="Most Gaussians.")] = (500, 2000, 8000)
+    schedules: Annotated[Names, _names("draft, fast, paper, rade.")] = ("draft", "fast")
+    shares: Annotated[tuple[float, ...], arg(metavar="X ...", help="Parts of the cameras, all first.")] = (1.0, 0.5)
+
+
+@dataclass(frozen=True)
+class RenderChart(ChartFlags):
+    """Measure error against time of relit images: both renderers, samples, shadows, maps and bounces.
+
+    Writes OUT/render.csv, .png and .html. The truth is path traced at pixels chosen at random.
+
+    Example: beam chart render person/asset.usda --environment studio.hdr --out chart
+    """
+
+    asset: Annotated[Positional[Path | None], arg(metavar="ASSET", help="A relightable asset.")] = None
+    environment: Annotated[
+        Path | None, arg(metavar="FILE", help="Light: lat-long, .exr or .hdr; a built-in low sun by default.")
+    ] = None
+    width: Annotated[int, arg(metavar="PX", help="Width and height of the image.")] = 256
+    repeats: Annotated[int, arg(metavar="N", help="Timed frames a setting; the median counts."), SECOND_PAGE] = 3
+
+
+@dataclass(frozen=True)
+class DeliveryChart(ChartFlags):
+    """Measure error against size of delivery (.b4d) by the factor of its bounds: relit images and, if installed, FLIP.
+
+    Writes OUT/delivery.csv, .png and .html. The truth is the asset itself, under a light and that light turned.
+
+    Example: beam chart delivery person/asset.usda --environment studio.hdr --out chart
+    """
+
+    asset: Annotated[Positional[Path | None], arg(metavar="ASSET", help="A relightable asset.")] = None
+    environment: Annotated[
+        Path | None, arg(metavar="FILE", help="Light: lat-long, .exr or .hdr; a built-in low sun by default.")
+    ] = None
+    scales: Annotated[tuple[float, ...], arg(metavar="X ...", help="Factors of the bounds.")] = (
+        *(0.25, 0.5, 1.0, 2.0, 4.0, 8.0),
+    )
+    width: Annotated[int, arg(metavar="PX", help="Width and height of the images.")] = 256
+
+
+@dataclass(frozen=True)
+class AllCharts(ChartFlags):
+    """Measure every chart that an asset, a capture or both allow, and put all of them on one page.
+
+    Of an asset: tracing, render, delivery. Of a capture: reconstruct; of one with an asset or its true surface:
+    materials. Writes OUT/chart.html, and what each chart writes. Every chart has the whole budget.
+
+    Example: beam chart all person/asset.usda --capture person --out chart
+    """
+
+    asset: Annotated[Positional[Path | None], arg(metavar="[ASSET]", help="A relightable asset.")] = None
+    capture: Annotated[Path | None, arg(metavar="DIR", help="The capture that it was reconstructed from.")] = None
+    environment: Annotated[
+        Path | None, arg(metavar="FILE", help="Light: lat-long, .exr or .hdr; the capture's, or a built-in low sun.")
+    ] = None
+
+
+Charted = TracingChart | MaterialsChart | ReconstructChart | RenderChart | DeliveryChart
+
+
+@dataclass(frozen=True)
 class Chart:
-    """Measure error against time on your own data and device, and mark the settings that no other beats in both."""
+    """Measure error against cost on your own data and device, and mark the settings that no other beats in both."""
 
     study: Annotated[
         Annotated[TracingChart, subcommand("tracing", prefix_name=False)]
-        | Annotated[MaterialsChart, subcommand("materials", prefix_name=False)],
+        | Annotated[MaterialsChart, subcommand("materials", prefix_name=False)]
+        | Annotated[ReconstructChart, subcommand("reconstruct", prefix_name=False)]
+        | Annotated[RenderChart, subcommand("render", prefix_name=False)]
+        | Annotated[DeliveryChart, subcommand("delivery", prefix_name=False)]
+        | Annotated[AllCharts, subcommand("all", prefix_name=False)],
         OmitArgPrefixes,
     ]
 
 
 def chart(command: Chart) -> int:
-    """Measure or read a table, draw it, and say what is on the frontier."""
+    """Measure or read tables, draw them, and say what is on the frontiers."""
     args = command.study
     for package in ("matplotlib", "plotly"):
         require_package(package)
-    files = [args.scene] if isinstance(args, TracingChart) else [args.asset, args.capture]
-    given = [str(path) for path in (*files, args.environment) if path is not None]
+    charts = _charts(args) if isinstance(args, AllCharts) else [args]
+    tables = [_draw(each) for each in charts]
+    page = args.out / "chart.html"
+    if isinstance(args, AllCharts):
+        write_page([table for table, _ in tables], page)
+    if args.json:
+        said = [_summary(table, skipped, args.out) for table, skipped in tables]
+        print_json({"charts": said, "page": str(page)} if isinstance(args, AllCharts) else said[0])
+    elif not args.quiet:
+        for table, skipped in tables:
+            _say(table, skipped, args.out)
+    return 0
+
+
+def _charts(args: AllCharts) -> list[Charted]:
+    """Return the charts that an asset and a capture allow.
+
+    Raises:
+        InvalidOptionError: There is neither, or a table is to be drawn again.
+    """
+    if args.from_csv is not None:
+        raise InvalidOptionError(f"from-csv must be left out for all charts, got {args.from_csv}. Draw that one alone.")
+    if args.asset is None and args.capture is None:
+        raise InvalidOptionError("asset or capture must be given for all charts, got neither. Name what is measured.")
+    shared: dict[str, Any] = {field.name: getattr(args, field.name) for field in fields(ChartFlags)}
+    lit, found = {**shared, "environment": args.environment}, list[Charted]()
+    if args.asset is not None:
+        found += [kind(**lit, asset=args.asset) for kind in (RenderChart, DeliveryChart)]
+        found.append(TracingChart(**lit, scene=args.asset))
+    if args.capture is not None:
+        found.append(ReconstructChart(**shared, capture=args.capture))
+        if args.asset is not None or (args.capture / "truth").is_dir():
+            found.append(MaterialsChart(**lit, asset=args.asset, capture=args.capture))
+    return found
+
+
+def _draw(args: Charted) -> tuple[Table, list[Settings]]:
+    """Measure or read a table, and draw it."""
+    names = ("scene", "asset", "capture", "environment")
+    given = [str(path) for name in names if (path := getattr(args, name, None)) is not None]
     if args.from_csv is not None and given:
         what = "a scene" if isinstance(args, TracingChart) else "an asset, a capture"
         raise InvalidOptionError(
@@ -189,23 +324,89 @@ def chart(command: Chart) -> int:
         table = read_table(args.from_csv)
         make_folders(args.out)
     else:
+        require_number("budget-seconds", args.budget_seconds, 0.0)
         with progress(args.quiet or args.json) as report:
-            measure = _measure if isinstance(args, TracingChart) else _measure_materials
-            table, skipped = measure(args, report)  # type: ignore[arg-type]
-    name = table.subject.name
-    image, page = args.out / f"{name}.png", args.out / f"{name}.html"
+            table, skipped = _MEASURES[type(args)](args, report)
+    image, page = _files(table, args.out)
     write_image(table, image)
-    write_page(table, page)
-    if args.json:
-        print_json(_summary(table, skipped, [image, page]))
-    elif not args.quiet:
-        _say(table, skipped, image, page)
-    return 0
+    write_page([table], page)
+    return table, skipped
+
+
+def _files(table: Table, out: Path) -> tuple[Path, Path]:
+    name = table.subject.name
+    return out / f"{name}.png", out / f"{name}.html"
+
+
+def _measure_reconstruction(args: ReconstructChart, report: NotedProgress) -> tuple[Table, list[Settings]]:
+    """Read or make the capture, prepare the study and measure it."""
+    from beam_warp.device.arrays import resolve_device
+    from beam_warp.study.reconstruction import reconstruction_study
+
+    resolve_device(args.device)
+    with tempfile.TemporaryDirectory() as folder:
+        capture, name = _capture(args.capture, Path(folder), args.frame, args.device, report)
+        number = capture.frames[require_count("frame", args.frame, 0, len(capture.frames) - 1)]
+        options = {name: getattr(args, name) for name in ("gaussians", "schedules", "shares")}
+        study = reconstruction_study(capture, number, name=name, device=args.device, **options)
+        make_folders(args.out)
+        return _run(study, args.out, args.budget_seconds, report)
+
+
+def _light(path: Path | None) -> EnvironmentMap:
+    from beam_warp.demo.lights import sunset
+
+    return sunset() if path is None else EnvironmentMap.read(path)
+
+
+def _asset(args: RenderChart | DeliveryChart) -> GaussianSequence:
+    if args.asset is None:
+        raise InvalidOptionError("asset must be given, got none. Name a relightable asset.")
+    sequence = converters.read(args.asset)
+    require_count("frame", args.frame, 0, len(sequence) - 1)
+    return sequence
+
+
+def _measure_rendering(args: RenderChart, report: NotedProgress) -> tuple[Table, list[Settings]]:
+    """Read the asset, prepare the study and measure it."""
+    from beam_warp.raster.records import RasterOptions
+    from beam_warp.study.relighting import relighting_study
+
+    sequence, light = _asset(args), _light(args.environment)
+    cloud = change_axes(sequence[args.frame], "rfu")
+    width = require_count("width", args.width, 1, MAX_SIDE)
+    camera = Camera.frame_cloud(
+        cloud.positions, cloud.opacities, azimuth=20.0, elevation=10.0, width=width, height=width
+    )
+    shot = Shot(cloud=cloud, camera=camera, environment=light)
+    raster = RasterOptions.from_metadata(sequence.metadata)
+    name = args.asset.name if args.asset is not None else ""
+    study = relighting_study(shot, raster, name=name, device=args.device, repeats=args.repeats)
+    make_folders(args.out)
+    return _run(study, args.out, args.budget_seconds, report)
+
+
+def _measure_delivery(args: DeliveryChart, report: NotedProgress) -> tuple[Table, list[Settings]]:
+    """Read the asset, prepare the study and measure it."""
+    from beam_warp.evaluate.perceptual import PerceptualMetrics
+    from beam_warp.study.delivery import delivery_study
+
+    sequence, light = _asset(args), _light(args.environment)
+    study = delivery_study(
+        sequence,
+        light,
+        name=args.asset.name if args.asset is not None else "",
+        scales=args.scales,
+        side=require_count("width", args.width, 1, MAX_SIDE),
+        flip=PerceptualMetrics.installed().measures.get("flip"),
+        device=args.device,
+    )
+    make_folders(args.out)
+    return _run(study, args.out, args.budget_seconds, report)
 
 
 def _measure(args: TracingChart, report: NotedProgress) -> tuple[Table, list[Settings]]:
     """Read the inputs, prepare the study and measure it."""
-    require_number("budget-seconds", args.budget_seconds, 0.0)
     from beam_warp.device.arrays import resolve_device
     from beam_warp.study.tracing import tracing_study
     from beam_warp.study.tracing_plan import TracingPlan
@@ -258,7 +459,6 @@ def _run(study: Study, out: Path, seconds: float, report: NotedProgress) -> tupl
 
 def _measure_materials(args: MaterialsChart, report: NotedProgress) -> tuple[Table, list[Settings]]:
     """Read or make the inputs, prepare the study and measure it."""
-    require_number("budget-seconds", args.budget_seconds, 0.0)
     from beam_warp.device.arrays import resolve_device
     from beam_warp.study.materials import materials_study
     from beam_warp.study.materials_plan import MaterialsPlan
@@ -272,29 +472,35 @@ def _measure_materials(args: MaterialsChart, report: NotedProgress) -> tuple[Tab
         return _run(study, args.out, args.budget_seconds, report)
 
 
+def _capture(
+    path: Path | None, folder: Path, frame: int, device: str | None, report: NotedProgress
+) -> tuple[Capture, str]:
+    """Return a capture and what to call it; without one, the built-in figure, written to the folder."""
+    from beam_warp.demo.capture import write_demo_capture
+
+    if path is not None:
+        return Capture.read(path), path.name
+    made = write_demo_capture(
+        folder / "capture",
+        frame_count=frame + 1,
+        camera_count=FIGURE_CAMERAS,
+        size=FIGURE_SIZE,
+        device=device,
+        progress=report,
+    )
+    return made, "the built-in figure"
+
+
 def _materials_subject(args: MaterialsChart, folder: Path, report: NotedProgress) -> Any:
     """Return what is decomposed; a built-in capture is written to the folder."""
-    from beam_warp.capture.capture import Capture
     from beam_warp.decomposition.capture_images import CaptureImages
-    from beam_warp.demo.capture import write_demo_capture
     from beam_warp.study.materials import MaterialsSubject
 
-    if args.capture is None:
-        if args.asset is not None:
-            raise InvalidOptionError(
-                f"capture must be given with an asset, got {args.asset} alone. Pass what it was reconstructed from."
-            )
-        capture = write_demo_capture(
-            folder / "capture",
-            frame_count=args.frame + 1,
-            camera_count=FIGURE_CAMERAS,
-            size=FIGURE_SIZE,
-            device=args.device,
-            progress=report,
+    if args.capture is None and args.asset is not None:
+        raise InvalidOptionError(
+            f"capture must be given with an asset, got {args.asset} alone. Pass what it was reconstructed from."
         )
-        name = "the built-in figure"
-    else:
-        capture, name = Capture.read(args.capture), args.capture.name
+    capture, name = _capture(args.capture, folder, args.frame, args.device, report)
     light = args.environment or capture.environment_path
     if light is None:
         raise InvalidOptionError(f"environment must be given, got none and {name} has none. Pass --environment.")
@@ -321,7 +527,17 @@ def _materials_subject(args: MaterialsChart, folder: Path, report: NotedProgress
     )
 
 
-def _summary(table: Table, skipped: list[Settings], files: list[Path]) -> dict[str, Any]:
+_MEASURES: dict[type, Any] = {
+    TracingChart: _measure,
+    MaterialsChart: _measure_materials,
+    ReconstructChart: _measure_reconstruction,
+    RenderChart: _measure_rendering,
+    DeliveryChart: _measure_delivery,
+}
+"""What measures each chart: it takes the words and a listener, and returns the table and what was left out."""
+
+
+def _summary(table: Table, skipped: list[Settings], out: Path) -> dict[str, Any]:
     """Return what was found, JSON-able."""
     return {
         "title": table.subject.title,
@@ -337,19 +553,20 @@ def _summary(table: Table, skipped: list[Settings], files: list[Path]) -> dict[s
             for metric in table.subject.metrics
             if not metric.by
         },
-        "files": [str(path) for path in files],
+        "files": [str(path) for path in _files(table, out)],
     }
 
 
-def _say(table: Table, skipped: list[Settings], image: Path, page: Path) -> None:
+def _say(table: Table, skipped: list[Settings], out: Path) -> None:
     """Print the frontier and what was left out."""
-    subject = table.subject
+    subject, (image, page) = table.subject, _files(table, out)
+    cost = f"{'time' if subject.cost_unit == 's' else 'size'} [{subject.cost_unit}]"
     print(subject.title)
     for metric in subject.metrics:
         frontier = table.frontier(metric)
         if not frontier:
             continue
-        print(f"\n{metric.title}: the frontier\n{'time [s]':>10} {'error':>10}  settings")
+        print(f"\n{metric.title}: the frontier\n{cost:>10} {'error':>10}  settings")
         for row in frontier:
             print(f"{row.cost.value:10.3g} {row.errors[metric.name].value:10.3g}  {subject.label(row.settings)}")
     print(f"\n{len(table.rows):,} of {subject.planned:,} planned settings measured; look at {image} and {page}")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,11 +18,18 @@ from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 from beam_warp.cli.common.pages import SECOND_PAGE
+from beam_warp.cli.common.targets import TargetFlags, chosen_rays, state
 from beam_warp.errors import InvalidOptionError
+from beam_warp.study.targets import Rung, Target, in_words
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.metadata import capture_frames_metadata, numbers_of_frames
 
 if TYPE_CHECKING:
     from beam_warp.decomposition.job import OverviewOptions, RunOptions, RunResult
+    from beam_warp.world.gaussians import GaussianSequence
+
+PILOT_HEIGHT = 64
+"""Height of a panel of a pilot's overview, which nobody looks at [pixel]."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,8 @@ class Decompose:
     Example: beam decompose walker/gaussians.usda --capture captures/walker --out walker_asset
 
     Example: beam decompose walker/gaussians.usda --capture captures/walker --preset paper --out walker_paper
+
+    Example: beam decompose walker/gaussians.usda --capture captures/walker --target-error 0.05 --out walker_asset
     """
 
     sequence: Annotated[Positional[Path], arg(metavar="SEQ", help="File of Gaussians, or a folder of numbered files.")]
@@ -99,6 +109,7 @@ class Decompose:
         arg(help="Rays from every Gaussian (ours), or from every pixel as in the paper: 50 and 100 rays, 2 cm offset."),
     ] = "direct"
     measuring: OmitArgPrefixes[Measuring] = field(default_factory=Measuring)
+    targets: OmitArgPrefixes[TargetFlags] = field(default_factory=TargetFlags)
     seed: Seed = 0
     device: Device = None
     quiet: Quiet = False
@@ -113,15 +124,27 @@ def decompose(args: Decompose) -> int:
         raise InvalidOptionError(
             "capture must be given for the preset paper, got none: it works on images. Name one with --capture."
         )
-    options = run_options(
-        args.measuring, capture, preset=args.preset, seed=args.seed, device=args.device, persistent=False
-    )
+    target = args.targets.target
+    if target is not None and args.preset == "paper":
+        raise InvalidOptionError(
+            f"targets must be left out with the preset paper, got {_listed(target)}. Its rays are the paper's."
+        )
+
+    def options_of(measuring: Measuring) -> RunOptions:
+        return run_options(measuring, capture, preset=args.preset, seed=args.seed, device=args.device, persistent=False)
+
+    options = options_of(args.measuring)
     environment = EnvironmentMap.read(light_of(args.measuring, capture, args.sequence)).rotated(args.measuring.rotate)
     sequence = converters.read(args.sequence)
 
     from beam_warp.decomposition.job import run as run_pipeline
 
     with progress(args.quiet or args.json) as report:
+        chosen = None
+        if target is not None:
+            source = Piloted(lambda: sequence, capture, environment, options_of)
+            chosen = rays_for(target, args.measuring, source, len(sequence), started)
+            options = options_of(with_rays(args.measuring, chosen))
         result = run_pipeline(
             sequence,
             environment,
@@ -131,12 +154,63 @@ def decompose(args: Decompose) -> int:
             overview=overview_options(args.measuring),
             progress=report,
         )
+    if target is not None and chosen is not None:
+        state_target(result, target, chosen, started)
     if args.json:
         print_json(result.report)
     elif not args.quiet:
         print_notes(result.report["input"]["notes"], result.report["warnings"])
         print(outcome(result, time.perf_counter() - started))
     return 0
+
+
+def _listed(target: Target) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in target.asked().items())
+
+
+@dataclass(frozen=True)
+class Piloted:
+    """Inputs of a decomposition whose rays are chosen by a pilot.
+
+    Attributes:
+        read: Returns the frames.
+        capture: Images that they were made from.
+        environment: The light.
+        options_of: Returns the job's options by its words.
+    """
+
+    read: Callable[[], GaussianSequence]
+    capture: Capture | None
+    environment: EnvironmentMap
+    options_of: Callable[[Measuring], RunOptions]
+
+
+def rays_for(target: Target, measuring: Measuring, source: Piloted, frame_count: int, started: float) -> Rung:
+    """Choose the rays of a decomposition that began at a time, by `time.perf_counter` [s]; see `chosen_rays`."""
+    from beam_warp.decomposition.job import OverviewOptions
+    from beam_warp.decomposition.job import run as run_pipeline
+
+    def pilot(folder: Path, rays: int, count: int) -> dict[str, Any]:
+        sequence, options = source.read(), source.options_of(replace(measuring, samples=rays))
+        numbers = numbers_of_frames(sequence.metadata, len(sequence))[:count]
+        metadata = {**sequence.metadata, **capture_frames_metadata(numbers)}
+        few = replace(sequence, frame_count=count, metadata=metadata)
+        view = OverviewOptions(height=PILOT_HEIGHT)
+        return run_pipeline(few, source.environment, folder, options, capture=source.capture, overview=view).report
+
+    return chosen_rays(target, pilot, measuring.samples, frame_count, lambda: time.perf_counter() - started)
+
+
+def with_rays(measuring: Measuring, chosen: Rung) -> Measuring:
+    """Return the words with the rays that a target chose."""
+    return replace(measuring, samples=int(chosen.settings["samples"]))
+
+
+def state_target(result: RunResult, target: Target, chosen: Rung, started: float) -> None:
+    """State what a target asked of a decomposition that began at a time, by `time.perf_counter` [s]; see `state`."""
+    error = result.report["materials"]["mean_base_color_error_where_measured"]
+    seconds = time.perf_counter() - started
+    state(result.report, result.asset.parent, target, chosen, error, len(result.sequence), seconds)
 
 
 def _seen_by(capture: Capture, sequence: Path) -> Capture:
@@ -224,6 +298,7 @@ def outcome(result: RunResult, seconds: float) -> str:
     """Return what came out, in some lines."""
     materials = result.report["materials"]
     frames, fitted = len(result.sequence), result.report["exposure_is_fitted"]
+    said = f"{in_words(result.report['target'])}\n" if "target" in result.report else ""
     return (
         f"wrote {result.asset}: {frames} frame{'s' if frames > 1 else ''}, "
         f"{result.report['input']['gaussians']:,} Gaussians, {seconds:.1f} s on {result.report['device']['name']}\n"
@@ -232,5 +307,6 @@ def outcome(result: RunResult, seconds: float) -> str:
         f"mean ambient occlusion {materials['mean_ambient_occlusion']:.3f}\n"
         f"mean standard error of base colour {materials['mean_base_color_error_where_measured']:.3f}, "
         f"{materials['flags']['FILLED']:,} Gaussians filled from neighbours\n"
+        f"{said}"
         f"overview: {result.overview}"
     )

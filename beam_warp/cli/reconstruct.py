@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -12,12 +16,20 @@ from beam_warp.capture.capture import Capture
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
+from beam_warp.cli.common.targets import TargetFlags, state
 from beam_warp.errors import InvalidOptionError
+from beam_warp.study.table import Settings
+from beam_warp.study.targets import Rung, Target, cheapest, climbed, fitted, in_words
 from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
     from beam_warp.reconstruction.frames.protocols import FrameSteps
     from beam_warp.reconstruction.job import ReconstructOptions
+
+USUAL_PRESET = "fast"
+
+PILOTS = 3
+"""Settings that are tried where no error is asked."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +39,10 @@ class Modelling:
     gaussians: Annotated[int | None, arg(metavar="N", help="Most Gaussians of a frame; the preset's by default.")] = (
         None
     )
-    target_psnr: Annotated[
-        float | None, arg(metavar="DB", help="Stop a fit here, or when more no longer pays, with fewer Gaussians.")
-    ] = None
     preset: Annotated[
-        Literal["fast", "draft", "paper", "rade"],
-        arg(help="Schedule: ours, few steps (for a CPU), the paper's 7,000 + 5,000, or like RaDe-GS's."),
-    ] = "fast"
+        Literal["fast", "draft", "paper", "rade"] | None,
+        arg(help="Schedule: ours (the default), few steps (for a CPU), the paper's 7,000 + 5,000, or like RaDe-GS's."),
+    ] = None
     segment_length: Annotated[
         int, arg(metavar="K", help="Frames from one key frame to the next, which workers share out; 0 for one segment.")
     ] = 0
@@ -66,11 +75,14 @@ class Reconstruct:
     workers; `beam plan OUT` says how far they are.
 
     Example: beam reconstruct captures/walker --gaussians 20000 --out walker
+
+    Example: beam reconstruct captures/walker --target-seconds 600 --out walker
     """
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE", help="Folder of a capture: images and cameras.")]
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     modelling: OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
+    targets: OmitArgPrefixes[TargetFlags] = field(default_factory=TargetFlags)
     workers: Workers = "1"
     seed: Seed = 0
     device: Device = None
@@ -80,17 +92,27 @@ class Reconstruct:
 
 def reconstruct(args: Reconstruct) -> int:
     """Reconstruct and say what came out."""
+    started = time.perf_counter()
     capture = Capture.read(args.capture)
-    options = options_of(args.modelling, capture)
+    options, target, chosen = options_of(args.modelling, capture), args.targets.target, None
     light = None if capture.environment_path is None else EnvironmentMap.read(capture.environment_path)
-    steps = steps_of(args.modelling, capture, args.seed, args.device, light)
+    asked = Asked(capture, args.seed, args.device, light)
 
     from beam_warp.plan.crew import crew_of
     from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
 
     crew = crew_of(args.workers, args.device)
+    modelling = args.modelling
     with progress(args.quiet or args.json) as report:
+        if target is not None:
+            chosen = modelling_for(target, modelling, asked, started)
+            modelling = with_modelling(modelling, chosen)
+        steps = steps_of(modelling, capture, args.seed, args.device, light)
         result = reconstruct_capture(capture, args.out, steps, options, progress=report, crew=crew)
+    if target is not None and chosen is not None:
+        error, seconds = _error(result.report), time.perf_counter() - started
+        reached = None if math.isnan(error) else error
+        state(result.report, args.out, target, chosen, reached, len(result.report["frames"]), seconds)
     if args.json:
         print_json(result.report)
     elif not args.quiet:
@@ -111,7 +133,105 @@ def summary(report: dict[str, Any]) -> str:
     if report["mean_psnr"] is not None:
         lowest = report["lowest_psnr"]
         words.append(f"{report['mean_psnr']:.2f} dB, lowest {lowest['psnr']:.2f} dB at frame {lowest['frame']}")
-    return ", ".join([*words, f"{report['seconds']:.1f} s on {report['device']['name']}"])
+    said = f"\n{in_words(report['target'])}" if "target" in report else ""
+    return ", ".join([*words, f"{report['seconds']:.1f} s on {report['device']['name']}"]) + said
+
+
+@dataclass(frozen=True)
+class Asked:
+    """All that a pilot of a reconstruction needs besides its words.
+
+    Attributes:
+        capture: Images and cameras.
+        seed: Same seed, same result.
+        device: Warp device; None for the first one.
+        light: The light of the capture, if it is known.
+    """
+
+    capture: Capture
+    seed: int
+    device: str | None
+    light: EnvironmentMap | None
+
+
+def modelling_for(target: Target, modelling: Modelling, asked: Asked, started: float) -> Rung:
+    """Choose Gaussians and schedule of a reconstruction that began at a time, by `time.perf_counter` [s].
+
+    The first frame is fitted by settings that cost more and more, until one meets the target's error. Without an error,
+    the costs of the cheapest three tell those of all: time falls on steps, and on Gaussians times steps. Where frames
+    follow by tracking, the cheapest setting is tried with two of them.
+
+    Raises:
+        InvalidOptionError: The target cannot be reached.
+    """
+    from beam_warp.reconstruction.fit import FitOptions
+    from beam_warp.reconstruction.frames.plan import plan_frames
+    from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
+
+    plan = plan_frames(asked.capture, options_of(modelling, asked.capture).frames, modelling.segment_length)
+    frames, keys = tuple(plan.records), len(plan.segments)
+    ladder, folders = _ladder(modelling), count()
+
+    def elapsed() -> float:
+        return time.perf_counter() - started
+
+    with TemporaryDirectory() as folder:
+
+        def pilot(settings: Settings, few: tuple[int, ...]) -> tuple[float, float]:
+            words, began = replace(modelling, **settings), time.perf_counter()
+            steps = steps_of(words, asked.capture, asked.seed, asked.device, asked.light)
+            options = replace(options_of(modelling, asked.capture), frames=few)
+            found = reconstruct_capture(asked.capture, Path(folder) / str(next(folders)), steps, options)
+            return time.perf_counter() - began, _error(found.report)
+
+        tracked = 0.0
+        if target.seconds is not None or target.fps is not None:
+            pilot(ladder[0], frames[:1])  # compiles
+            if len(frames) > keys:
+                both, first = (pilot(ladder[0], frames[:number])[0] for number in (2, 1))
+                tracked = max(both - first, 0.0) / first
+        whole = keys + (len(frames) - keys) * tracked if tracked else len(frames)
+
+        def rung(settings: Settings, seconds: float, error: float = math.nan) -> Rung:
+            job = whole * seconds
+            return Rung(settings=settings, seconds=job, frame_seconds=job / len(frames), error=error, spent=elapsed())
+
+        def measure(settings: Settings) -> Rung:
+            return rung(settings, *pilot(settings, frames[:1]))
+
+        if target.error is not None or len(ladder) <= PILOTS:
+            return cheapest(climbed(ladder, measure, target, elapsed), target)
+
+        def cost(settings: Settings) -> list[float]:
+            fit = FitOptions.of_preset(str(settings["preset"]))
+            steps = fit.color_iterations + fit.normal_iterations
+            return [steps, steps * float(settings["gaussians"])]
+
+        seconds = [pilot(settings, frames[:1])[0] for settings in ladder[:PILOTS]]
+        model = fitted([cost(settings) for settings in ladder[:PILOTS]], seconds)
+        return cheapest([rung(settings, float(model @ cost(settings))) for settings in ladder], target)
+
+
+def _ladder(modelling: Modelling) -> list[Settings]:
+    """Return what a target may choose of Gaussians and schedules, the cheapest first; what is stated stays."""
+    from beam_warp.reconstruction.fit import FitOptions
+
+    most, preset = FitOptions().gaussian_count, modelling.preset
+    parts = [(16, "draft"), (8, "draft"), (4, "draft"), (4, "fast"), (2, "fast"), (1, "fast")]
+    found = [
+        {"gaussians": modelling.gaussians or most // part, "preset": preset or schedule} for part, schedule in parts
+    ]
+    return [settings for place, settings in enumerate(found) if settings not in found[:place]]
+
+
+def with_modelling(modelling: Modelling, chosen: Rung) -> Modelling:
+    """Return the words with what a target chose."""
+    return replace(modelling, **chosen.settings)
+
+
+def _error(report: dict[str, Any]) -> float:
+    """Return the root mean square error of colour in the photographs."""
+    return math.nan if report["mean_psnr"] is None else 10.0 ** (-report["mean_psnr"] / 20.0)
 
 
 def steps_of(
@@ -122,12 +242,13 @@ def steps_of(
     from beam_warp.reconstruction.steps import FitAndTrack
     from beam_warp.reconstruction.track import TrackOptions
 
-    asked: dict[str, Any] = {"target_psnr": modelling.target_psnr, "seed": seed}
+    asked: dict[str, Any] = {"seed": seed}
     if modelling.gaussians is not None:
         asked["gaussian_count"] = modelling.gaussians
-    tracking = TrackOptions.of_preset(modelling.preset)
+    preset = modelling.preset or USUAL_PRESET
+    tracking = TrackOptions.of_preset(preset)
     return FitAndTrack(
-        fitting=FitOptions.of_preset(modelling.preset, **asked),
+        fitting=FitOptions.of_preset(preset, **asked),
         tracking=replace(tracking, refinement=replace(tracking.refinement, seed=seed)),
         points=capture.points(),
         environment=environment,

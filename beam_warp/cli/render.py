@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_count
@@ -13,10 +14,12 @@ from beam_warp.cli.common.flags import raster_options, stated
 from beam_warp.cli.drawing.checks import require_consistent
 from beam_warp.cli.drawing.flags import Render
 from beam_warp.cli.drawing.stage import staged
+from beam_warp.cli.drawing.targets import RenderPilot, Watched, with_settings
 from beam_warp.cli.drawing.views import capture_views, image_size
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.video import INSTALL, VideoOptions, find_ffmpeg
 from beam_warp.outputs import require_apart
+from beam_warp.raster.records import RasterOptions
 from beam_warp.render.options import LAYERS, DeferredOptions
 from beam_warp.render.path import PathOptions
 from beam_warp.stage.frame_times import FrameTimes, frame_times
@@ -25,6 +28,7 @@ from beam_warp.stage.output import Film, FramePattern, Still, numbered, parse_ta
 from beam_warp.stage.pictures import BLACK, PictureOptions, PictureWriter
 from beam_warp.stage.renderers import DeferredFrames, PathFrames
 from beam_warp.stage.stage import Stage
+from beam_warp.study.targets import in_words, outcome
 from beam_warp.world.metadata import numbers_of_frames
 
 DEFAULT_SAMPLES = 2
@@ -64,30 +68,47 @@ def render(args: Render) -> int:
     started = time.perf_counter()
     capture = None if args.camera.capture is None else Capture.read(args.camera.capture)
     stage, frame_count = staged(args, capture)
-    device = str(resolve_device(args.device))
-    renderer = _renderer(args, stage)
+    device, target, said = resolve_device(args.device), args.targets.target, None
     picture, notes = _picture(args)
     with progress(args.quiet or args.json) as report:
+        renderer = _renderer(args, stage)  # refuses what is out of range
         plan = _plan(args, stage, frame_count) if capture is None else _plan_of_capture(args, stage, capture)
         require_apart(plan.outputs, "out")
-        job = RenderJob(stage, renderer, PictureWriter(picture), report)
-        tally = _carry_out(plan, job, overwrite=args.output.overwrite)
-    said = list(dict.fromkeys((*stage.notes, *notes, *plan.notes)))
-    _say(args, plan, tally, said, device, time.perf_counter() - started)
+        writer, raster = PictureWriter(picture), _raster(args, stage)
+        if target is None:
+            tally = _carry_out(plan, RenderJob(stage, renderer, writer, report), overwrite=args.output.overwrite)
+        else:
+            tried = plan.requests[len(plan.requests) // 2]
+            pilot = RenderPilot(
+                args=args,
+                shot_of=lambda: tried.shot(stage),
+                frames=len(plan.requests),
+                writer=writer,
+                raster=raster,
+                device=device,
+                elapsed=lambda: time.perf_counter() - started,
+            )
+            chosen = pilot.chosen(target)
+            args = with_settings(args, chosen)
+            watched = Watched(_renderer(args, stage))
+            tally = _carry_out(plan, RenderJob(stage, watched, writer, report), overwrite=args.output.overwrite)
+            reached = watched.reached(target, raster, device, time.perf_counter() - started)
+            said = outcome(target, chosen, reached)
+    notes = list(dict.fromkeys((*stage.notes, *notes, *plan.notes)))
+    _say(args, plan, tally, notes, str(device), time.perf_counter() - started, said)
     return 0
+
+
+def _raster(args: Render, stage: Stage) -> RasterOptions:
+    """Return how splats are drawn."""
+    return raster_options(stage.raster_metadata, args.deferred.antialiased, args.deferred.low_pass)
 
 
 def _renderer(args: Render, stage: Stage) -> FrameRenderer:
     """Make the renderer that was asked for; options that were not given are its own."""
     if args.mode == "path":
         path = args.path
-        options = stated(
-            samples=path.spp,
-            bounces=args.bounces,
-            target_error=path.target_error,
-            seed=path.seed,
-            denoiser=path.denoise,
-        )
+        options = stated(samples=path.spp, bounces=args.bounces, seed=path.seed, denoiser=path.denoise)
         return PathFrames(PathOptions(**options), device=args.device)
     flags, aov = args.deferred, args.output.aov
     options = stated(
@@ -96,9 +117,8 @@ def _renderer(args: Render, stage: Stage) -> FrameRenderer:
         environment_shadows=flags.environment_shadows,
         light_map_size=flags.shadow_resolution,
     )
-    raster = raster_options(stage.raster_metadata, flags.antialiased, flags.low_pass)
     shading = DeferredOptions(layers=LAYERS if aov else (), **options)
-    return DeferredFrames(shading, raster=raster, errors=aov, device=args.device)
+    return DeferredFrames(shading, raster=_raster(args, stage), errors=aov, device=args.device)
 
 
 def _picture(args: Render) -> tuple[PictureOptions, list[str]]:
@@ -176,7 +196,15 @@ def _carry_out(plan: RenderPlan, job: RenderJob, *, overwrite: bool) -> RenderTa
     return job.render_frames(plan.target, plan.requests, overwrite=overwrite)
 
 
-def _say(args: Render, plan: RenderPlan, tally: RenderTally, notes: list[str], device: str, seconds: float) -> None:
+def _say(
+    args: Render,
+    plan: RenderPlan,
+    tally: RenderTally,
+    notes: list[str],
+    device: str,
+    seconds: float,
+    target: dict[str, Any] | None,
+) -> None:
     """Print the result."""
     outputs = plan.outputs
     if args.json:
@@ -187,10 +215,11 @@ def _say(args: Render, plan: RenderPlan, tally: RenderTally, notes: list[str], d
                 "rendered": len(tally.rendered),
                 "kept": len(tally.kept),
                 "gaussian_count": tally.gaussian_count,
-                "mode": args.mode,
+                "mode": args.mode or "deferred",
                 "device": device,
                 "notes": notes,
                 "seconds": round(seconds, 3),
+                **({} if target is None else {"target": target}),
             }
         )
         return
@@ -203,3 +232,5 @@ def _say(args: Render, plan: RenderPlan, tally: RenderTally, notes: list[str], d
     kept = f"{len(tally.kept)} of them were there, " if tally.kept else ""
     gaussians = f"{tally.gaussian_count:,} Gaussians, " if tally.rendered else ""
     print(f"wrote {outputs[0]}{last}: {images}{kept}{gaussians}{seconds:.2f} s")
+    if target is not None:
+        print(in_words(target))

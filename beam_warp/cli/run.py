@@ -16,13 +16,29 @@ from beam_warp.checks import require_number, require_path
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, DropInvalid, Json, MetersPerUnit, Quiet, Seed, SourceAxes, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
-from beam_warp.cli.decompose import Measuring, light_of, outcome, overview_options, run_options
-from beam_warp.cli.reconstruct import Modelling, options_of, steps_of, summary
+from beam_warp.cli.common.targets import TargetFlags
+from beam_warp.cli.decompose import (
+    Measuring,
+    Piloted,
+    light_of,
+    outcome,
+    overview_options,
+    rays_for,
+    run_options,
+    state_target,
+    with_rays,
+)
+from beam_warp.cli.reconstruct import Asked, Modelling, modelling_for, options_of, steps_of, summary, with_modelling
 from beam_warp.converters.numbering import SOG_NAMES, holds_gaussians
 from beam_warp.errors import InvalidOptionError, MissingFileError
+from beam_warp.study.targets import Target
 from beam_warp.world.environment import EnvironmentMap
 
+RECONSTRUCTION_PART = 0.75
+"""Part of the time that is asked for which a capture's reconstruction may take; materials get what is left."""
+
 if TYPE_CHECKING:
+    from beam_warp.decomposition.job import RunOptions
     from beam_warp.reconstruction.job import ReconstructionWork
     from beam_warp.world.gaussians import GaussianSequence
 
@@ -38,6 +54,8 @@ class Run:
     Example: beam run person.compressed.ply --environment studio.hdr --out person
 
     Example: beam run captures/walker --gaussians 20000 --out walker
+
+    Example: beam run person.ply --environment studio.hdr --target-seconds 60 --out person
     """
 
     input: Annotated[
@@ -47,6 +65,7 @@ class Run:
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     modelling: OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
     measuring: OmitArgPrefixes[Measuring] = field(default_factory=Measuring)
+    targets: OmitArgPrefixes[TargetFlags] = field(default_factory=TargetFlags)
     source_axes: Annotated[SourceAxes, SECOND_PAGE] = None
     meters_per_unit: Annotated[MetersPerUnit, SECOND_PAGE] = None
     persistent: Annotated[
@@ -75,22 +94,45 @@ def run(args: Run) -> int:
     from beam_warp.decomposition.job import run_capture, run_materials
     from beam_warp.decomposition.work import MaterialWork
     from beam_warp.plan.crew import crew_of
+    from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
 
-    crew = crew_of(args.workers, args.device)
-    options = run_options(
-        args.measuring, capture, preset="direct", seed=args.seed, device=args.device, persistent=args.persistent
-    )
-    view = overview_options(args.measuring)
+    crew, target = crew_of(args.workers, args.device), args.targets.target
+    if target is not None and target.fps is not None and capture is not None:
+        raise InvalidOptionError(
+            f"target-fps must be left out for a capture, got {target.fps:g}: both its jobs take time. Give "
+            "--target-seconds."
+        )
+
+    def options_for(measuring: Measuring) -> RunOptions:
+        return run_options(
+            measuring, capture, preset="direct", seed=args.seed, device=args.device, persistent=args.persistent
+        )
+
+    options, view, chosen = options_for(args.measuring), overview_options(args.measuring), None
     with progress(args.quiet or args.json) as report:
         if capture is None:
             given = GivenFrames(partial(_read, args), None)
+            if target is not None:
+                source = Piloted(given.sequence, None, environment, options_for)
+                chosen = rays_for(target, args.measuring, source, len(given.numbers()), started)
+                options = options_for(with_rays(args.measuring, chosen))
             work = MaterialWork(require_path("out", args.out), given, environment, options, report)
             result, reconstruction = run_materials(work, view, started, crew), None
         else:
-            frames = _frame_work(args, capture, environment)
+            modelling = _modelling(args, capture, environment, started)
+            frames = _frame_work(args, modelling, capture, environment)
+            if target is not None:
+                found = reconstruct_capture(
+                    capture, frames.folder, frames.steps, frames.options, progress=report, crew=crew
+                )
+                source = Piloted(lambda: found.sequence, found.capture, environment, options_for)
+                chosen = rays_for(target, args.measuring, source, len(found.sequence), started)
+                options = options_for(with_rays(args.measuring, chosen))
             work = MaterialWork(args.out, ReconstructedFrames(frames, args.fps), environment, options, report)
             both = run_capture(frames, work, view, started, crew)
             result, reconstruction = both.result, both.reconstruction.report
+    if target is not None and chosen is not None:
+        state_target(result, target, chosen, started)
     if args.json:
         print_json(result.report if reconstruction is None else {**result.report, "reconstruction": reconstruction})
     elif not args.quiet:
@@ -118,7 +160,7 @@ def _check_words(args: Run, capture: Capture | None) -> None:
     """Refuse words that do not go with the input."""
     if capture is None and args.modelling != Modelling():
         raise InvalidOptionError(
-            "gaussians, target-psnr, preset, segment-length, cameras, masks, exposures and frames must be left out "
+            "gaussians, preset, segment-length, cameras, masks, exposures and frames must be left out "
             f"unless the input is a capture, got {args.input}. Drop them."
         )
     of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)
@@ -137,11 +179,21 @@ def _read(args: Run) -> GaussianSequence:
     return sequence if args.fps is None else replace(sequence, frames_per_second=args.fps)
 
 
-def _frame_work(args: Run, capture: Capture, environment: EnvironmentMap) -> ReconstructionWork:
+def _modelling(args: Run, capture: Capture, environment: EnvironmentMap, started: float) -> Modelling:
+    """Return how the capture is modelled: within its part of the time, where one is asked for."""
+    asked = args.targets.target_seconds
+    if asked is None:
+        return args.modelling
+    target = Target(seconds=RECONSTRUCTION_PART * asked)
+    source = Asked(capture, args.seed, args.device, environment)
+    return with_modelling(args.modelling, modelling_for(target, args.modelling, source, started))
+
+
+def _frame_work(args: Run, modelling: Modelling, capture: Capture, environment: EnvironmentMap) -> ReconstructionWork:
     from beam_warp.jobs.store import make_folders
     from beam_warp.reconstruction.job import ReconstructionWork
 
-    steps = steps_of(args.modelling, capture, args.seed, args.device, environment)
-    options = options_of(args.modelling, capture)
+    steps = steps_of(modelling, capture, args.seed, args.device, environment)
+    options = options_of(modelling, capture)
     make_folders(args.out)
     return ReconstructionWork.prepare(capture, args.out / "reconstruction", steps, options)

@@ -245,6 +245,10 @@ class PathProgress:
         self._images = zero_struct(PathImages, pixel_count, self._device)
         self._pixels = upload(_tiled(shot.camera.width, shot.camera.height), int, self._device)
 
+    def only(self, pixels: NDArray[np.integer[Any]]) -> None:
+        """Trace some pixels alone, by their numbers row by row; the others stay black."""
+        self._pixels = upload(np.asarray(pixels, np.int32), int, self._device)
+
     @property
     def done(self) -> bool:
         """Whether every pixel has its samples, or its target error."""

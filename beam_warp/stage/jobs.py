@@ -71,6 +71,11 @@ class FrameRequest:
     height: int
     camera: Camera | None = None
 
+    def shot(self, stage: Stage) -> Shot:
+        """Return what is rendered."""
+        shot = stage.shot(self.time, self.width, self.height)
+        return shot if self.camera is None else replace(shot, camera=self.camera)
+
 
 @dataclass(eq=False)
 class RenderTally:
@@ -179,8 +184,7 @@ class RenderJob:
             self._report("encode", done, len(frames))
 
     def _shot(self, frame: FrameRequest) -> Shot:
-        shot = self._stage.shot(frame.time, frame.width, frame.height)
-        return shot if frame.camera is None else replace(shot, camera=frame.camera)
+        return frame.shot(self._stage)
 
     def _draw(self, frame: FrameRequest, path: Path, tally: RenderTally, shot: Shot | None = None) -> None:
         """Render an image and write it."""

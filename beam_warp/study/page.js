@@ -1,4 +1,5 @@
 // Draws the table of a study: every factor has toggles, and the Pareto frontier is that of what is shown.
+// This is the body of a function of data, a table, and root, the element that it is drawn in.
 "use strict";
 
 const COLORS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"];
@@ -6,7 +7,6 @@ const SYMBOLS = ["circle", "triangle-up", "square", "diamond", "triangle-down", 
 const DASHES = ["solid", "dash", "dot", "dashdot"];
 const CROWDED = 0.1; // decades
 
-const data = JSON.parse(document.getElementById("data").textContent);
 const subject = data.subject;
 const axisOf = Object.fromEntries(subject.axes.map((axis) => [axis.name, axis]));
 const hidden = Object.fromEntries(subject.axes.map((axis) => [axis.name, new Set()]));
@@ -262,15 +262,15 @@ function drawEffect(metric, plot) {
 }
 
 function build() {
-  element("h1", subject.title, document.body);
+  element("h1", subject.title, root);
   const planned = subject.planned > data.rows.length ? ` of ${subject.planned} planned` : "";
   element(
     "p",
     "Lower left is better. Numbered: the Pareto frontier of what is shown, which no other setting beats in both cost " +
       `and error. ${data.rows.length} settings measured${planned}. Point at a mark for its settings.`,
-    document.body,
+    root,
   );
-  const controls = element("div", "", document.body, { class: "controls" });
+  const controls = element("div", "", root, { class: "controls" });
   const draws = [];
   const draw = () => draws.forEach((each) => each());
   for (const axis of subject.axes.filter((each) => each.levels.length > 1)) {
@@ -287,7 +287,7 @@ function build() {
       });
     }
   }
-  const panels = element("div", "", document.body, { class: "panels" });
+  const panels = element("div", "", root, { class: "panels" });
   for (const metric of subject.metrics) {
     const own = data.rows.filter((row) => metric.name in row.errors);
     const choices = subject.axes.filter((axis) => new Set(own.map((row) => row.settings[axis.name])).size > 1);
@@ -312,7 +312,7 @@ function build() {
     const list = element("table", "", panel);
     draws.push(() => drawCurves(metric, plot, list));
   }
-  const notes = element("dl", "", document.body);
+  const notes = element("dl", "", root);
   for (const [title, text] of Object.entries(subject.notes)) {
     element("dt", title, notes);
     element("dd", text, notes);

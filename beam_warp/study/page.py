@@ -1,9 +1,10 @@
-"""A study's table as one self-contained HTML page: pointing shows settings, toggles choose what is compared."""
+"""Tables of studies as one self-contained HTML page: pointing shows settings, toggles choose what is compared."""
 
 from __future__ import annotations
 
 import html
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
@@ -28,8 +29,15 @@ dt { font-weight: bold; } dd { margin: 0; }
 """
 
 
-def write_page(table: Table, path: Path) -> None:
-    """Write a table as one HTML file that needs no network.
+EACH = """
+for (const data of JSON.parse(document.getElementById("data").textContent))
+  chart(data, document.body.appendChild(document.createElement("main")));
+"""
+"""Script that draws every table of a page."""
+
+
+def write_page(tables: Sequence[Table], path: Path) -> None:
+    """Write tables, at least one, as one HTML file that needs no network.
 
     Raises:
         InvalidOptionError: plotly is not installed.
@@ -40,13 +48,14 @@ def write_page(table: Table, path: Path) -> None:
 
     script = files("beam_warp.study").joinpath("page.js").read_text(encoding="utf-8")
     # "<" is escaped, so that no text in the data can end the element that holds it
-    data = json.dumps(_data(table), ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    data = json.dumps([_data(table) for table in tables], ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     page = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(table.subject.title)}</title>\n<style>{STYLE}</style>\n"
+        f"<title>{html.escape(tables[0].subject.title)}</title>\n<style>{STYLE}</style>\n"
         f"<script>{get_plotlyjs()}</script>\n</head>\n<body>\n"
-        f'<script type="application/json" id="data">{data}</script>\n<script>{script}</script>\n</body>\n</html>\n'
+        f'<script type="application/json" id="data">{data}</script>\n'
+        f"<script>function chart(data, root) {{\n{script}}}{EACH}</script>\n</body>\n</html>\n"
     )
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")

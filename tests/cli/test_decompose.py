@@ -62,6 +62,7 @@ OPTIONS = {
     "device": None,
     "quiet": None,
     "json": None,
+    "targets": None,
     "environment": "--environment {folder}/dim.exr",
     "relight": "--relight {folder}/dim.exr",
     "orbit": "--orbit 30 10",

@@ -42,13 +42,13 @@ def asked(monkeypatch):
 class TestReconstruct:
     def test_all_is_written_and_said(self, folder, asked, tmp_path, capsys):
         out = tmp_path / "out"
-        assert beam("reconstruct", folder, "--out", out, "--gaussians", 40, "--target-psnr", 35, "--seed", 3) == 0
+        assert beam("reconstruct", folder, "--out", out, "--gaussians", 40, "--seed", 3) == 0
         said = capsys.readouterr()
         assert "gaussians.usda: 4 frames, 2 segments, 40 to 45 Gaussians, " in said.out
         assert "dB, lowest 28.80 dB at frame 1" in said.out
         assert "warning: tracking was lost at frame 2 (too bright)" in said.err
         modelling, seed, _ = asked[0]
-        assert (modelling.gaussians, modelling.target_psnr, modelling.preset, seed) == (40, 35.0, "fast", 3)
+        assert (modelling.gaussians, modelling.preset, seed) == (40, None, 3)
         for name in ("gaussians.usda", "report.json", "previews/frame_000003.png", "frames/frame_000003.h5"):
             assert (out / name).is_file()
 
@@ -162,15 +162,11 @@ class TestDetection:
 def test_the_words_reach_the_optimiser(folder):
     """What is asked on the command line is what the steps are made of, and goes into the keys of the store."""
     capture = Capture.read(folder)
-    steps = steps_of(
-        Modelling(gaussians=123, target_psnr=31.5, preset="paper"), capture, seed=7, device="cpu", environment=None
-    )
+    steps = steps_of(Modelling(gaussians=123, preset="paper"), capture, seed=7, device="cpu", environment=None)
     asked = json.loads(json.dumps(steps.options()))["fitting"]
-    assert (asked["gaussian_count"], asked["target_psnr"], asked["seed"]) == (123, 31.5, 7)
+    assert (asked["gaussian_count"], asked["seed"]) == (123, 7)
     assert steps.device == "cpu"
-    fast = steps_of(
-        Modelling(gaussians=123, target_psnr=31.5), capture, 7, "cpu", EnvironmentMap.constant([1.0, 1.0, 1.0])
-    )
+    fast = steps_of(Modelling(gaussians=123), capture, 7, "cpu", EnvironmentMap.constant([1.0, 1.0, 1.0]))
     assert steps.options() != fast.options()
     assert steps.options()["environment"] != fast.options()["environment"]
 

@@ -280,10 +280,10 @@ class TestStage:
 
 class TestRenderers:
     def test_paths(self, common_still, recorder, tmp_path):
-        more = ["--spp", 8, "--bounces", 2, "--target-error", 0.01, "--denoise", "bilateral", "--seed", 7]
+        more = ["--spp", 8, "--bounces", 2, "--denoise", "bilateral", "--seed", 7]
         assert run(*common_still, "--out", tmp_path / "x.png", "--mode", "path", *more) == 0
         options, more = recorder.options[0]
-        assert (options.samples, options.bounces, options.target_error) == (8, 2, 0.01)
+        assert (options.samples, options.bounces) == (8, 2)
         assert (options.denoiser, options.seed) == ("bilateral", 7)
         assert more == {"device": "cpu"}
 
@@ -344,7 +344,7 @@ def test_without_ffmpeg_there_are_images_and_a_note(common, recorder, tmp_path, 
         ("x.mp4 --aov", "out must end in .exr to hold the layers of --aov, got x.mp4"),
         ("x.png --crf 10", "crf must be left out unless out ends in .mp4, got 10"),
         ("x.png --spp 9", "spp must be left out with --mode deferred, got 9"),
-        ("x.png --target-error 0.1", "target-error must be left out with --mode deferred, got 0.1"),
+        ("x.png --target-error 0", "target-error must be a number in [1e-09, 1e+09], got 0.0"),
         ("x.png --mode path --environment-shadows 4", "environment-shadows must be left out with"),
         ("x.png --mode path --low-pass 1", "low-pass must be left out with --mode path, got 1.0"),
         ("x.png --low-pass 0", "low-pass must be a number in [1e-06, 1e+06], got 0.0"),

@@ -23,9 +23,8 @@ def require_consistent(args: Render) -> None:
     _require_one_motion(args)
     if not isinstance(args.output.background, str):
         require_range("background", np.asarray(args.output.background), 0.0, 1.0, "Use display values from 0 to 1.")
-    refuse(
-        args.deferred if args.mode == "path" else args.path, f"with --mode {args.mode}", why="The other mode has it."
-    )
+    other = args.deferred if args.mode == "path" else args.path
+    refuse(other, f"with --mode {args.mode or 'deferred'}", why="The other mode has it.")
     if args.is_stage:
         staged = ("spacing", "on_ground", "source_axes", "meters_per_unit", "drop_invalid")
         refuse(args.assets, "with a stage", staged, why="The stage states it.")

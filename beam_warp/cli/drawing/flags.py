@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp.cli.common.flags import Antialiased, Device, DropInvalid, Json, LowPass, MetersPerUnit, Quiet, SourceAxes
 from beam_warp.cli.common.pages import SECOND_PAGE
+from beam_warp.cli.common.targets import TargetFlags
 from beam_warp.converters.numbering import SOG_NAMES
 
 
@@ -73,7 +74,9 @@ class LightFlags:
     environment: Annotated[
         Path | None, arg(metavar="FILE", help="Lat-long light, .exr or .hdr; by default the capture's or stage's own.")
     ] = None
-    rotate: Annotated[float, arg(metavar="DEG", help="Turn it about z, counter-clockwise from above.")] = 0.0
+    rotate: Annotated[float, arg(metavar="DEG", help="Turn it about z, counter-clockwise from above."), SECOND_PAGE] = (
+        0.0
+    )
     rotate_per_second: Annotated[float, arg(metavar="DEG", help="Go on turning it as the film plays."), SECOND_PAGE] = (
         0.0
     )
@@ -158,15 +161,7 @@ class DeferredFlags:
 class PathFlags:
     """How ``--mode path`` renders."""
 
-    spp: Annotated[
-        int | None,
-        arg(metavar="N", help="Path: samples a pixel, at most if there is an error to reach; 64 by default."),
-    ] = None
-    target_error: Annotated[
-        float | None,
-        arg(metavar="E", help="Path: stop where noise is below this display value; 0.004 is 8 bits' step."),
-        SECOND_PAGE,
-    ] = None
+    spp: Annotated[int | None, arg(metavar="N", help="Path: samples a pixel; 64 by default.")] = None
     denoise: Annotated[
         Literal["none", "auto", "oidn", "bilateral"] | None,
         arg(help="Path: take the noise off; none by default."),
@@ -208,6 +203,8 @@ class Render:
     Several. Example: beam render a.usdz b.usdz --spacing 1 --environment studio.hdr --ground shadows --out both.png
 
     A stage. Example: beam render stage.json --mode path --target-error 0.004 --denoise auto --out stage.mp4
+
+    In real time. Example: beam render person.usdz --environment studio.hdr --target-fps 30 --out person.mp4
     """
 
     assets: OmitArgPrefixes[AssetFlags]
@@ -216,8 +213,9 @@ class Render:
     light: OmitArgPrefixes[LightFlags] = field(default_factory=LightFlags)
     time: OmitArgPrefixes[TimeFlags] = field(default_factory=TimeFlags)
     mode: Annotated[
-        Literal["deferred", "path"], arg(help="Deferred shading in real time, or path tracing, which takes its time.")
-    ] = "deferred"
+        Literal["deferred", "path"] | None,
+        arg(help="Deferred shading in real time (the default), or path tracing, which takes its time."),
+    ] = None
     bounces: Annotated[
         int | None,
         arg(metavar="N", help="How often light goes from surface to surface; 4 by default, deferred 2."),
@@ -225,6 +223,7 @@ class Render:
     ] = None
     deferred: OmitArgPrefixes[DeferredFlags] = field(default_factory=DeferredFlags)
     path: OmitArgPrefixes[PathFlags] = field(default_factory=PathFlags)
+    targets: OmitArgPrefixes[TargetFlags] = field(default_factory=TargetFlags)
     device: Device = None
     quiet: Annotated[Quiet, SECOND_PAGE] = False
     json: Annotated[Json, SECOND_PAGE] = False
