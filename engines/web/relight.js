@@ -14,7 +14,7 @@ import {Environment} from "./environment.js";
 import {GpuError, WebGL2, WebGPU} from "./gpu.js";
 import {checkedLights, depthRow, lampNumbers, mapNumbers, shadowViews} from "./lights.js";
 import * as passes from "./shaders.js";
-import {SHADING} from "./shading.js";
+import {GLSL, GLSL_FETCHING, WGSL, WGSL_FETCHING} from "./shading.js";
 import {sorter} from "./sorting.js";
 
 const {ROW, ORDER, CHANNELS, BINS} = passes;
@@ -86,15 +86,11 @@ export class Relight extends EventTarget {
     const {blendFormat: format} = this.gpu, program = (spec) => this.gpu.program(spec);
     this.#programs = {
       geometry: program(passes.geometry), materials: program(passes.materials), gbuffer: program(passes.gbuffer(format)),
-      deferred: program(passes.deferred(this.#shading("all"))), display: program(passes.display(this.#shading("pure"), this.backend === "webgl2")),
+      deferred: program(passes.deferred({glsl: GLSL + GLSL_FETCHING, wgsl: WGSL + WGSL_FETCHING})), display: program(passes.display({glsl: GLSL, wgsl: WGSL}, this.backend === "webgl2")),
     };
     this.#textures = {nothing: this.#filled([FAR_AWAY, 0, 0, 0]), noMap: this.gpu.texture({width: 1, height: 1, layers: 1, format: "rgba32float"})};
     this.#upload(this.#environment);
     this.gpu.onLost((message) => this.#lost(message));
-  }
-
-  #shading(part) {
-    return Object.fromEntries(["glsl", "wgsl"].map((name) => [name, part === "all" ? SHADING[name].pure + SHADING[name].fetching : SHADING[name].pure]));
   }
 
   /** Programs that only lamps need are made when there is the first one. */
@@ -475,24 +471,24 @@ export class Relight extends EventTarget {
     const filters = [Number(low) > 0 ? Number(low) : 0.3, 0.01, thin === "true" ? 1 : 0, 0];
     const sums = [0, 1, 2].map((k) => this.#texture(`sums${k}`, width, height, format));
     this.gpu.draw(this.#programs.gbuffer, {...this.#splats(view, order, filters), targets: sums, clear: [0, 0, 0, 0]});
-    const hasLamps = this.#lights.length > 0 && this.#maps.lights === this.#lights;
+    const lights = this.#lights.length ? this.#maps.lights ?? [] : [], hasLamps = lights.length > 0; // those that maps are of
     if (hasLamps) {
       this.#lampPrograms();
       this.#drawMaps();
     }
     const medians = hasLamps ? this.#median(view, order, filters, "medians") : t.nothing;
     let first = 0;
-    const lamps = hasLamps ? this.#lights.flatMap((light, k) => {
+    const lamps = lights.flatMap((light, k) => {
       const maps = this.#maps.views[k].length;
       first += maps;
       return lampNumbers(light, first - maps, maps);
-    }) : [];
+    });
     const thickness = this.#casters ? Math.min(this.thickness, THICKEST * this.#casters.radius) : 0, angle = this.rotation * Math.PI / 180;
     const lit = this.#texture("lit", width, height, "rgba32float");
     this.gpu.draw(this.#programs.deferred, {targets: [lit], textures: {sums0: sums[0], sums1: sums[1], sums2: sums[2], medians,
       environment: t.environment, albedo: t.albedo, shadows: this.#textures.shadows ?? t.noMap},
     uniforms: {...cameraNumbers(view, 0), turn: [Math.cos(angle), Math.sin(angle), 0, 0], levels: this.levels, lamps,
-      counts: [hasLamps ? this.#lights.length : 0, this.background === "environment" && this.channel === "relit" ? 1 : 0, 0, 0],
+      counts: [lights.length, this.background === "environment" && this.channel === "relit" ? 1 : 0, 0, 0],
       maps: hasLamps ? this.#maps.views.flat().flatMap((each) => mapNumbers(each, thickness)) : []}});
     return true;
   }
