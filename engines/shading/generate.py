@@ -2,10 +2,10 @@
 
     python engines/shading/generate.py [--slangc PATH] [--check]
 
-Needs ``slangc`` of the package slangtorch (Apache 2.0). slangc emits what an entry point reaches, so a kernel that calls
-every function is added, and cut out again; numbers that slangc appends to names of functions, structs and members go.
-The five functions that an engine defines (`HOOKS`) are declared in C-like languages, and otherwise left open; what calls
-them stands in a part of its own.
+Needs ``slangc`` of the package slangtorch (Apache 2.0). slangc emits what an entry point reaches, so a kernel that
+calls every function is added, and cut out again; numbers that slangc appends to names of functions, structs and members
+go. The five functions that an engine defines (`HOOKS`) are declared in C-like languages, and otherwise left open; what
+calls them stands in a part of its own.
 """
 
 from __future__ import annotations
