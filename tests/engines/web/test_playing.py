@@ -1,8 +1,13 @@
 """Playing on the web: frames and their blends, damaged and lost segments, a GPU that goes, pages without a server."""
 
+import base64
+import json
+from io import BytesIO
+
 import numpy as np
 import pytest
-from engines.web.pages import CANVAS_FLAGS, FLAGS, MODULE, camera_record, chromium, numbers, open_page
+from engines.web.pages import CANVAS_FLAGS, MODULE, camera_record, chromium, numbers, open_page
+from PIL import Image
 from support.drawn_ball import relightable
 from web.viewers import CHROMIUM
 
@@ -56,7 +61,8 @@ def test_the_gpu_evaluates_frames_and_blends_as_the_decoder_does(browser, take):
         for (const at of [0, 3.25, 11, 12, 14.5, 99]) {{
           made.time = at / {RATE};
           await made.render(camera);
-          const last = {FRAMES - 1}, low = Math.min(Math.floor(at), last), high = Math.min(low + 1, last), t = Math.min(at, last) - low;
+          const last = {FRAMES - 1}, low = Math.min(Math.floor(at), last), high = Math.min(low + 1, last);
+          const t = Math.min(at, last) - low;
           const [a, b] = [await take.frame(low), await take.frame(high)];
           out.push([packed(await made.read("positions")), packed(await made.read("colors")),
             packed(mixed(a.positions, b.positions, t)), packed(mixed(a.ambient_occlusion, b.ambient_occlusion, t))]);
@@ -155,7 +161,7 @@ def test_a_canvas_shows_what_webgpu_and_webgl2_draw(browser, take):
         await made.render(camera);
         await new Promise(requestAnimationFrame); }}"""
     for backend, flags in (("webgl2", ()), ("webgpu", CANVAS_FLAGS)):
-        with chromium(flags) if flags else chromium() as opened:
+        with chromium(*([flags] if flags else [])) as opened:
             page = open_page(opened, {"take.b4d": take})
             page.evaluate(script, backend)
             shown[backend] = picture_of(page)
@@ -165,42 +171,37 @@ def test_a_canvas_shows_what_webgpu_and_webgl2_draw(browser, take):
 
 
 def picture_of(page):
-    from io import BytesIO
-
-    from PIL import Image
-
     return np.asarray(Image.open(BytesIO(page.locator("#canvas").screenshot())).convert("RGB"))
 
 
-def test_a_page_from_a_file_plays_a_take_from_its_bytes(browser, take, tmp_path):
-    """Modules cannot be imported from files: as in a page of one file, each is a blob that names the others."""
-    order = ("b4d", "gpu", "environment", "lights", "sorting", "shaders", "shading", "relight", "index")
-    sources = {name: (MODULE / f"{name}.js").read_text() for name in order}
-    import base64
-    import json
+FILE_PAGE = """<!doctype html><script>
+const sources = SOURCES, places = {};
+for (const [name, text] of Object.entries(sources)) {
+  const bound = text.replace(/from "\\.\\/(\\w+)\\.js"/g, (_, other) => `from "${places[other]}"`);
+  places[name] = URL.createObjectURL(new Blob([bound], {type: "text/javascript"}));
+}
+const bytes = Uint8Array.from(atob("BYTES"), (c) => c.charCodeAt(0));
+window.played = (async () => {
+  PRELUDE
+  const {Relight, Take} = await import(places.index);
+  const made = await Relight.create(null, {backend: "webgl2"});
+  await made.open(await Take.from(bytes));
+  made.time = 1.3;
+  const drawn = await made.render(camera);
+  return [drawn, Math.max(...await made.read("sums0"))];
+})();
+</script>"""
+"""Modules cannot be imported from files: as in a page of one file, each is a blob that names the others."""
 
-    page_file = tmp_path / "page.html"
-    page_file.write_text(
-        f"""<!doctype html><script>
-        const sources = {json.dumps(sources).replace("</", "<\\/")}, places = {{}};
-        for (const [name, text] of Object.entries(sources)) {{
-          const bound = text.replace(/from "\\.\\/(\\w+)\\.js"/g, (_, other) => `from "${{places[other]}}"`);
-          places[name] = URL.createObjectURL(new Blob([bound], {{type: "text/javascript"}}));
-        }}
-        const bytes = Uint8Array.from(atob("{base64.b64encode(take.read_bytes()).decode()}"), (c) => c.charCodeAt(0));
-        window.played = (async () => {{ {PRELUDE}
-          const {{Relight, Take}} = await import(places.index);
-          const made = await Relight.create(null, {{backend: "webgl2"}});
-          await made.open(await Take.from(bytes));
-          made.time = 1.3;
-          const drawn = await made.render(camera);
-          return [drawn, Math.max(...await made.read("sums0"))];
-        }})();
-        </script>""",
-        encoding="utf-8",
-    )
+
+def test_a_page_from_a_file_plays_a_take_from_its_bytes(browser, take, tmp_path):
+    order = ("b4d", "gpu", "environment", "lights", "sorting", "shaders", "shading", "relight", "index")
+    sources = json.dumps({name: (MODULE / f"{name}.js").read_text(encoding="utf-8") for name in order})
+    text = FILE_PAGE.replace("BYTES", base64.b64encode(take.read_bytes()).decode()).replace("PRELUDE", PRELUDE)
+    file = tmp_path / "page.html"
+    file.write_text(text.replace("SOURCES", sources.replace("</", "<\\/")), encoding="utf-8")
     page = browser.new_page()
-    page.goto(page_file.as_uri())
+    page.goto(file.as_uri())
     drawn, most = page.evaluate("window.played")
     assert drawn
     assert most > 0.3
@@ -211,7 +212,8 @@ def test_nothing_is_kept_of_what_was_shown(browser, take):
     page = open_page(browser, {"take.b4d": take})
     first, last = page.evaluate(
         f"""async () => {{ {PRELUDE}
-        const made = await make({{backend: "webgl2", shadowMapSize: 32}}), counts = [], take = await Take.open("/take.b4d");
+        const made = await make({{backend: "webgl2", shadowMapSize: 32}}), counts = [];
+        const take = await Take.open("/take.b4d");
         for (let k = 0; k < 12; k++) {{
           if (k % 4 === 0) await made.open(take);
           made.lights = k % 2 ? [{{type: "directional", direction: [1, 1, -1], irradiance: [1, 1, 1]}}] : [];
@@ -224,5 +226,4 @@ def test_nothing_is_kept_of_what_was_shown(browser, take):
         return [most, Math.max(...counts.slice(6), made.gpu.made.size)]; }}"""
     )
     assert last <= first
-    assert FLAGS
     page.close()
