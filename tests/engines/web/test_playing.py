@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from engines.web.pages import CANVAS_FLAGS, MODULE, camera_record, chromium, numbers, open_page
 from PIL import Image
-from support.drawn_ball import relightable
+from support.drawn_ball import drawn_ball, relightable
 from web.viewers import CHROMIUM
 
+from beam_warp import rasterize
 from beam_warp.converters import WriteOptions, write
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianSequence
@@ -74,6 +75,34 @@ def test_the_gpu_evaluates_frames_and_blends_as_the_decoder_does(browser, take):
         found = numbers(places, -1, 4)[:COUNT, :3]
         assert np.abs(found - np.stack([x, -z, y], axis=1)).max() < 2e-6
         assert np.abs(numbers(colors, -1, 4)[:COUNT, 3] - numbers(occlusion, COUNT)).max() < 2e-6
+    page.close()
+
+
+def test_captured_colour_is_that_of_the_rasteriser(browser, tmp_path):
+    rng = np.random.default_rng(4)
+    ball = drawn_ball(count=600)
+    ball = ball.with_arrays(
+        scales=np.tile([0.06, 0.06, 1e-3], (600, 1)), radiance=0.2 * rng.normal(size=(1, 16, 3)).repeat(600, axis=0)
+    )
+    path = tmp_path / "ball.b4d"
+    write(GaussianSequence.from_clouds([ball]), path, WriteOptions(error_scale=0.02, sh_degree=3))
+    camera = Camera.look_at((0.8, -2.0, 0.9), (0, 0, 0), width=64, height=48, vertical_fov=40)
+    page = open_page(browser, {"ball.b4d": path})
+    sums, channels = page.evaluate(
+        """async (camera) => {
+        const made = await make({backend: "webgl2"});
+        await made.open(await Take.open("/ball.b4d"));
+        made.channel = "radiance";
+        await made.render(camera);
+        return [packed(await made.read("sums0")), made.channels]; }""",
+        camera_record(camera),
+    )
+    sums, buffer = numbers(sums, 48, 64, 4), rasterize(ball, camera, channels=["radiance"], device="cpu")
+    assert "radiance" in channels
+    solid = buffer.alpha > 0.5
+    found = sums[..., :3] / np.maximum(sums[..., 3:], 1e-6)
+    assert np.abs(found - buffer.channels["radiance"])[solid].max() < 5e-3
+    assert np.ptp(buffer.channels["radiance"][solid]) > 0.3
     page.close()
 
 
