@@ -569,7 +569,8 @@ export class Relight extends EventTarget {
    * Return what was drawn last, RGBA a pixel, top row first: "lit", floats (radiance times alpha, and alpha); "picture",
    * bytes for a display, of a renderer without a canvas; "sums0" … "sums2" and "medians", the G-buffer.
    */
-  read(name = "lit") {
+  async read(name = "lit") {
+    require(this.#textures[name], "what is read must have been drawn", name);
     return this.gpu.read(this.#textures[name]);
   }
 }
