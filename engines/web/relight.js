@@ -91,7 +91,7 @@ export class Relight extends EventTarget {
     };
     this.#textures = {nothing: this.#filled([0, 0, 0, 0]), noMap: this.gpu.texture({width: 1, height: 1, layers: 1, format: "rgba32float"})};
     this.#upload(this.#environment);
-    this.gpu.onLost((message) => this.#lost(message));
+    this.gpu.onLost((message) => this.#lost(message), (message) => this.#tell("error", {message}));
   }
 
   /** Programs that only lamps need are made when there is the first one. */
