@@ -37,7 +37,7 @@ def take(tmp_path_factory):
     clouds = [
         base.with_arrays(
             positions=base.positions + 0.1 * np.sin(0.4 * frame + base.positions[:, ::-1]),
-            ambient_occlusion=rng.random(COUNT),
+            ambient_occlusion=rng.uniform(0.2, 0.8, COUNT),  # a blend is clamped after it is made
             ids=np.arange(COUNT),
         )
         for frame in range(FRAMES)
