@@ -38,8 +38,12 @@ SEEK = """async ([backend, camera, seeks]) => {
   const opened = performance.now() - began, decoded = [], ready = [], drawn = [];
   await made.render(camera);
   await made.read();
-  for (let k = 0; k < seeks; k++) { // far from each other, so that a segment is never there already
-    const {segments, rate} = take.manifest, entry = segments[(5 * k + 3) % segments.length];
+  for (let k = 0; k < seeks; k++) { // from the beginning again each time, so that the segment is not there already
+    const {segments, rate} = take.manifest, entry = segments[2 + k % (segments.length - 2)];
+    await made.open(take);
+    made.time = 0;
+    await made.render(camera);
+    await made.read();
     let from = performance.now();
     await take.tracks(entry, entry.frames);
     decoded.push(performance.now() - from);
