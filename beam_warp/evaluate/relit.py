@@ -1,0 +1,121 @@
+"""How far the relit images of an asset are from those of another one: the error of a reduction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.evaluate.perceptual import PerceptualMetrics
+from beam_warp.evaluate.trials import RelitTrials, Trial
+from beam_warp.image.metrics import as_compared, psnr
+from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.raster.records import RasterOptions
+from beam_warp.render.deferred import DeferredRenderer
+from beam_warp.render.options import DeferredOptions
+from beam_warp.world.axes import change_axes
+from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
+from beam_warp.world.shot import RenderedImage
+
+ASSET_PSNR = 35.0
+"""PSNR of a good asset's relit images against the truth [dB]."""
+
+COMPARED = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=512, layers=())
+"""How trials are drawn: the split sum with ambient occlusion, and shadow maps of lamps."""
+
+
+def loss_of(psnr: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what an asset of `ASSET_PSNR` loses against the truth by errors that are independent of its own [dB].
+
+    Args:
+        psnr: Of its images against those before the errors [dB].
+    """
+    return 10.0 * np.log10(1.0 + 10.0 ** ((ASSET_PSNR - np.asarray(psnr)) / 10.0))
+
+
+@dataclass(frozen=True, eq=False)
+class RelitErrors:
+    """Errors of trials, in their order.
+
+    Attributes:
+        psnr: PSNR of the images against those of the original, in the subject's box on black, as sRGB [dB], ``(T,)``.
+        flip: Mean FLIP there, ``(T,)``; None unless it was asked for.
+    """
+
+    psnr: NDArray[np.float64]
+    flip: NDArray[np.float64] | None
+
+    def values(self, measure: str) -> NDArray[np.float64]:
+        """Return errors by the name of their measure: ``loss`` [dB], see `loss_of`, or ``flip``."""
+        if measure == "loss":
+            return loss_of(self.psnr)
+        assert self.flip is not None
+        return self.flip
+
+
+class RelitComparison:
+    """Compares assets with an original; images of the original are kept for as long as trials repeat."""
+
+    def __init__(
+        self,
+        original: GaussianSequence,
+        trials: RelitTrials,
+        *,
+        raster: RasterOptions | None = None,
+        metrics: PerceptualMetrics | None = None,
+        device: Any = None,
+    ) -> None:
+        """Choose the original, and how images are drawn and compared.
+
+        Args:
+            original: Relightable, any axes.
+            trials: The distribution.
+            raster: How splats are drawn; as the original states without.
+            metrics: With ``flip`` if that is to be measured.
+            device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+        """
+        self.original, self.trials = original, trials
+        self.metrics = metrics or PerceptualMetrics()
+        options = raster or RasterOptions.from_metadata(original.metadata)
+        prepared = [PreparedEnvironment(light, device) for light in trials.environments]
+        self._renderers = [
+            DeferredRenderer(COMPARED, raster=options, device=device, prepared=prepared) for _ in range(2)
+        ]
+        self._kept: dict[Trial, RenderedImage] = {}
+
+    def errors(self, other: GaussianSequence, trials: Sequence[Trial], *, keep: bool = False) -> RelitErrors:
+        """Return the errors of an asset.
+
+        Args:
+            other: As many frames as the original.
+            trials: Draws of the distribution.
+            keep: Whether the original's images of these trials will be wanted again.
+        """
+        found, flip = np.zeros(len(trials)), np.full(len(trials), np.nan)
+        for frame in sorted({trial.frame for trial in trials}):
+            pair = world(self.original, frame), world(other, frame)
+            for place, trial in enumerate(trials):
+                if trial.frame == frame:
+                    found[place], flip[place] = self._compared(trial, *pair, keep)
+        return RelitErrors(found, flip if "flip" in self.metrics.measures else None)
+
+    def _compared(self, trial: Trial, original: GaussianCloud, cloud: GaussianCloud, keep: bool) -> tuple[float, float]:
+        truth = self._kept.get(trial)
+        if truth is None:
+            truth = self._renderers[0].draw(self.trials.shot(trial, original, original))
+            if keep:
+                self._kept[trial] = truth
+        found = self._renderers[1].draw(self.trials.shot(trial, cloud, original))
+        compared = as_compared(
+            found.rgb, truth.rgb, alpha=found.alpha, truth_alpha=truth.alpha, is_color=True, premultiplied=True
+        )
+        differences = self.metrics.differences(compared.image, compared.truth)
+        return psnr(compared.image, compared.truth), differences.get("flip", np.nan)
+
+
+def world(sequence: GaussianSequence, frame: int) -> GaussianCloud:
+    """Return a frame in the world's axes."""
+    return change_axes(sequence[frame], WORLD_AXES)
