@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.evaluate.perceptual import PerceptualMetrics
+from beam_warp.errors import MissingPackageError
+from beam_warp.evaluate.perceptual import Measure, PerceptualMetrics
 from beam_warp.evaluate.trials import RelitTrials, Trial
 from beam_warp.image.metrics import as_compared, psnr
 from beam_warp.light.prepared import PreparedEnvironment
@@ -65,7 +66,7 @@ class RelitComparison:
         trials: RelitTrials,
         *,
         raster: RasterOptions | None = None,
-        metrics: PerceptualMetrics | None = None,
+        measure: str = "loss",
         device: Any = None,
     ) -> None:
         """Choose the original, and how images are drawn and compared.
@@ -74,11 +75,14 @@ class RelitComparison:
             original: Relightable, any axes.
             trials: The distribution.
             raster: How splats are drawn; as the original states without.
-            metrics: With ``flip`` if that is to be measured.
+            measure: ``flip`` if that is to be measured besides the loss.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+
+        Raises:
+            MissingPackageError: FLIP cannot be measured here.
         """
         self.original, self.trials = original, trials
-        self.metrics = metrics or PerceptualMetrics()
+        self._flip = require_flip() if measure == "flip" else None
         options = raster or RasterOptions.from_metadata(original.metadata)
         prepared = [PreparedEnvironment(light, device) for light in trials.environments]
         self._renderers = [
@@ -100,7 +104,7 @@ class RelitComparison:
             for place, trial in enumerate(trials):
                 if trial.frame == frame:
                     found[place], flip[place] = self._compared(trial, *pair, keep)
-        return RelitErrors(found, flip if "flip" in self.metrics.measures else None)
+        return RelitErrors(found, None if self._flip is None else flip)
 
     def _compared(self, trial: Trial, original: GaussianCloud, cloud: GaussianCloud, keep: bool) -> tuple[float, float]:
         truth = self._kept.get(trial)
@@ -112,8 +116,21 @@ class RelitComparison:
         compared = as_compared(
             found.rgb, truth.rgb, alpha=found.alpha, truth_alpha=truth.alpha, is_color=True, premultiplied=True
         )
-        differences = self.metrics.differences(compared.image, compared.truth)
-        return psnr(compared.image, compared.truth), differences.get("flip", np.nan)
+        images = (np.ascontiguousarray(each, np.float32) for each in (compared.image, compared.truth))
+        flip = np.nan if self._flip is None else self._flip(*images)
+        return psnr(compared.image, compared.truth), flip
+
+
+def require_flip() -> Measure:
+    """Return how FLIP is measured.
+
+    Raises:
+        MissingPackageError: It cannot be measured here.
+    """
+    metrics = PerceptualMetrics.installed()
+    if "flip" not in metrics.measures:
+        raise MissingPackageError(f"max-flip must have a program to measure FLIP, got none: {metrics.absent['flip']}.")
+    return metrics.measures["flip"]
 
 
 def world(sequence: GaussianSequence, frame: int) -> GaussianCloud:

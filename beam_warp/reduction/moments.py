@@ -58,7 +58,9 @@ class Clusters:
         mass = optical_mass(reference)
         self._mass = self._shares(mass + 1e-9 * mass.max(initial=1e-30))
         seen = np.asarray(visible, np.float64)
-        self._seen = self._shares(seen + 1e-6 * (mass / max(mass.max(initial=0.0), 1e-30) + 1e-3) * (seen.mean() + 1e-9))
+        self._seen = self._shares(
+            seen + 1e-6 * (mass / max(mass.max(initial=0.0), 1e-30) + 1e-3) * (seen.mean() + 1e-9)
+        )
         order = np.lexsort((np.arange(len(mass)), -(seen + 1e-9 * mass), self._labels))
         self._heaviest = order[np.flatnonzero(np.diff(self._labels[order], prepend=-1))]
         self._orientations, self._scales, self._depth = self._shapes(mass)
