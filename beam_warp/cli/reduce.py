@@ -26,9 +26,9 @@ UNITS = {"": 1, "B": 1, "KB": 1000, "MB": 1000**2, "GB": 1000**3}
 class Reduce:
     """Merge Gaussians until a target is met: a bound on the error of relit images, a size, or a number.
 
-    Errors are measured over random lights, cameras and frames: environments turned, suns, lamps. The certificate is made
-    on draws that the search did not see, and is written into the asset; beam-validate --physical repeats it. See
-    docs/reducing.md.
+    Errors are measured over random lights, cameras and frames: environments turned, suns, lamps. The certificate is
+    made on draws that the search did not see, and is written into the asset; beam-validate --physical repeats it.
+    See docs/reducing.md.
 
     Example: beam reduce person/asset.usda --out small.usda --max-loss 0.5
     """
@@ -38,9 +38,9 @@ class Reduce:
     ]
     out: Annotated[Path, arg(metavar="FILE", help="Asset to write: .usda, .usdc, or .b4d for players.")]
     max_loss: Annotated[
-        float | None, arg(metavar="DB", help="Most loss of a good asset's PSNR against the truth, for 95 %% of draws.")
+        float | None, arg(metavar="DB", help="Most loss of a good asset's PSNR against the truth, in 19 of 20 draws.")
     ] = None
-    max_flip: Annotated[float | None, arg(metavar="X", help="Most FLIP against the original, for 95 %% of draws.")] = (
+    max_flip: Annotated[float | None, arg(metavar="X", help="Most FLIP against the original, in 19 of 20 draws.")] = (
         None
     )
     size: Annotated[str | None, arg(metavar="BYTES", help="Most bytes of the file, such as 20MB.")] = None
@@ -48,9 +48,7 @@ class Reduce:
     environment: Annotated[
         tuple[Path, ...], arg(metavar="FILE ...", help="One to four lights to measure under; else the demo's three.")
     ] = ()
-    height: Annotated[
-        int, arg(metavar="PX", help="Side of the images that are compared: how large it will be seen.")
-    ] = 256
+    height: Annotated[int, arg(metavar="PX", help="Side of compared images: how large it will be seen.")] = 256
     pairs: Annotated[int, arg(metavar="N", help="Draws of light, camera and frame for the certificate.")] = 200
     confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate.")] = 0.95
     views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 48

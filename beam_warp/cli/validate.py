@@ -40,8 +40,7 @@ class Validate:
     fix: Annotated[bool, arg(help="Mend in place what is safe to mend, then check.")] = False
     physical: Annotated[bool, arg(help="Also trace the asset and judge it by physics, which is slower.")] = False
     original: Annotated[
-        Path | None,
-        arg(metavar="ASSET", help="What a reduced asset was made from: --physical repeats its certificate."),
+        Path | None, arg(metavar="ASSET", help="What it was reduced from: --physical repeats its certificate.")
     ] = None
     environment: Annotated[
         tuple[Path, ...], arg(metavar="FILE ...", help="The lights that `beam reduce` was given, if any.")

@@ -77,8 +77,9 @@ class Certificate:
         unit = " dB" if self.measure == "loss" else ""
         low, high = (f"{end:.3g}" for end in self.mean[1:])
         return (
-            f"{self.measure} at most {self.bound:.3g}{unit} for at least {self.share:.1%} of lights, cameras and frames, "
-            f"with {self.confidence:.1%} confidence ({self.within} of {self.pairs} draws; mean {self.mean[0]:.3g}, "
+            f"{self.measure} at most {self.bound:.3g}{unit} for at least {self.share:.1%} of lights, cameras and "
+            f"frames, with {self.confidence:.1%} confidence "
+            f"({self.within} of {self.pairs} draws; mean {self.mean[0]:.3g}, "
             f"{low} to {high}; {self.psnr:.1f} dB against the original)"
         )
 
@@ -108,11 +109,9 @@ class Certificate:
             sound = sound and 0.0 < made.confidence < 1.0 and 0.0 <= made.first <= 2**31 and made.bound >= 0.0
             sound = sound and {"environments", "height", "seed"} <= set(made.distribution)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-            raise AssetFormatError(
-                f"{KEY} must be a certificate, got {text[:40]!r}. Reduce the asset again."
-            ) from error
+            raise AssetFormatError(f"{KEY} must be a certificate, got {text[:40]!r}. Reduce it again.") from error
         if not sound:
-            raise AssetFormatError(f"{KEY} must be a certificate, got numbers out of range. Reduce the asset again.")
+            raise AssetFormatError(f"{KEY} must be a certificate, got numbers out of range. Reduce it again.")
         return made
 
 

@@ -1,10 +1,11 @@
 """Random lights, cameras and frames under which two assets are compared: one stated distribution, drawn by number.
 
 A trial is a frame, a camera and a light. The camera sees all of the subject from an azimuth that is uniform and an
-elevation between `LOWEST` and `HIGHEST`, uniform over the sphere. The light is, with even chances, an environment alone,
-turned by a uniform angle, or that environment dimmed to `DIMMED` beside a lamp: the sun, or a small sphere that is
-`NEAREST` to `FURTHEST` radii of the subject away, both anywhere above the horizon, with shadows. Environments are exposed
-so that the white diffuser that gets most light has the radiance `BRIGHTEST_WHITE`; lamps give `LAMP_WHITE` of it.
+elevation between `LOWEST` and `HIGHEST`, uniform over the sphere. The light is, with even chances, an environment
+alone, turned by a uniform angle, or that environment dimmed to `DIMMED` beside a lamp: the sun, or a small sphere that
+is `NEAREST` to `FURTHEST` radii of the subject away, both anywhere above the horizon, with shadows. Environments are
+exposed so that the white diffuser that gets most light has the radiance `BRIGHTEST_WHITE`; one that faces a lamp gets
+`LAMP_WHITE` of it.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ class RelitTrials:
         """
         if not 1 <= len(environments) <= MOST_ENVIRONMENTS:
             raise InvalidOptionError(
-                f"environment must be 1 to {MOST_ENVIRONMENTS} maps, got {len(environments)}. Choose which lights count."
+                f"environment must be 1 to {MOST_ENVIRONMENTS} maps, got {len(environments)}. Choose some."
             )
         self.height = require_count("height", height, 16, 4096)
         self.seed = require_count("seed", seed, 0, 2**32 - 1)
@@ -117,12 +118,12 @@ class RelitTrials:
         around, up = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.05, 1.0)
         flat = np.sqrt(1.0 - up * up)
         return Trial(
-            frame=int(frames[rng.integers(len(frames))]),
+            frame=int(frames[int(rng.integers(len(frames)))]),
             azimuth=float(rng.uniform(0.0, 360.0)),
             elevation=float(np.degrees(np.arcsin(rng.uniform(low, high)))),
             environment=int(rng.integers(len(self.environments) // 2)),
             turn=float(rng.uniform(0.0, 360.0)),
-            lamp=str(rng.choice(["none", "none", "sun", "sphere"])),
+            lamp=("none", "none", "sun", "sphere")[int(rng.integers(4))],
             toward=(float(flat * np.cos(around)), float(flat * np.sin(around)), float(up)),
             distance=float(rng.uniform(NEAREST, FURTHEST)),
         )
@@ -147,11 +148,15 @@ class RelitTrials:
         radius = max(float(np.linalg.norm(points - center, axis=1).max()), 1e-3)
         away = trial.distance * radius
         intensity, place = power * away * away, center + away * np.asarray(trial.toward)
-        sphere = PointLight(position=tuple(place), intensity=(intensity,) * 3, radius=0.05 * radius)
+        sphere = PointLight(
+            position=(float(place[0]), float(place[1]), float(place[2])),
+            intensity=(intensity, intensity, intensity),
+            radius=0.05 * radius,
+        )
         return dim, (sphere,)
 
     def shot(self, trial: Trial, cloud: GaussianCloud, framed: GaussianCloud) -> Shot:
-        """Return the shot of a cloud; camera and lamp stand as they do for ``framed``, the asset that it is judged by."""
+        """Return the shot of a cloud; camera and lamp stand as for ``framed``, which it is judged by."""
         environment, lights = self.lights(trial, framed)
         return Shot(
             cloud=cloud,

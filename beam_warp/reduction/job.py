@@ -115,8 +115,8 @@ class ReduceOptions:
         require_count("steps", self.steps, 0, 100_000)
         if self.bound is not None and not least_pairs(self.confidence) <= self.pairs:
             raise InvalidOptionError(
-                f"pairs must be at least {least_pairs(self.confidence)} for a bound that {SHARE:.0%} keep with confidence "
-                f"{self.confidence:g}, got {self.pairs}. Measure more."
+                f"pairs must be at least {least_pairs(self.confidence)} for a bound that {SHARE:.0%} keep with "
+                f"confidence {self.confidence:g}, got {self.pairs}. Measure more."
             )
 
     @property
@@ -277,7 +277,7 @@ def reduce_asset(
             count, scale = min(len(reducer), int(np.ceil(MORE * count))), None if scale is None else 0.5 * scale
         else:
             raise InvalidOptionError(
-                f"{options.target} must be attainable, got {options.bound:g}: {made}. Allow more, or measure more pairs."
+                f"{options.target} must be attainable, got {options.bound:g}: {made}. Allow more, or give more pairs."
             )
         final = replace(search.candidate(count), metadata={**original.metadata, **made.as_metadata()})
         paths = converters.write(final, out, _written_as(scale))
@@ -307,6 +307,7 @@ class _Search:
     def __init__(self, reducer: Reducer, comparison: RelitComparison, place: Path) -> None:
         self._reducer, self._comparison, self._place, self._options = reducer, comparison, place, reducer.options
         self.tried: list[tuple[int, float]] = []
+        self._stored = 0
         self._made: dict[tuple[int, int], GaussianSequence] = {}
         start = 3 * reducer.options.views
         self._draws = reducer.trials.draw("search", range(start, start + TRIED), range(len(reducer.original)))
@@ -316,7 +317,7 @@ class _Search:
         """Return the reduced asset of a number of Gaussians, made once."""
         key = count, self._options.steps if steps is None else steps
         if key not in self._made:
-            self._made[key] = self._reducer.reduced(*key)
+            self._made[key] = self._reducer.reduced(count, steps=steps)
         return self._made[key]
 
     def error(self, sequence: GaussianSequence) -> float:
@@ -325,8 +326,10 @@ class _Search:
 
     def stored(self, count: int, scale: float | None, steps: int | None = None) -> tuple[GaussianSequence, int]:
         """Return a candidate as it reads once it is stored, and its size [byte]."""
-        paths = converters.write(self.candidate(count, steps), self._place, _written_as(scale))
-        return converters.read(self._place), sum(path.stat().st_size for path in paths)
+        self._stored += 1  # files that were read are not replaced
+        place = self._place.with_stem(f"{self._place.stem}{self._stored}")
+        paths = converters.write(self.candidate(count, steps), place, _written_as(scale))
+        return converters.read(place), sum(path.stat().st_size for path in paths)
 
     def target(self) -> tuple[int, float | None]:
         """Return how many Gaussians meet the target, and how exactly they are delivered, None for USD."""

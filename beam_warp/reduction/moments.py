@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud
 from beam_warp.world.quaternions import rotation_matrices
 
 MOST_OPACITY = 0.99
@@ -100,9 +100,9 @@ class Clusters:
         stretch = self._mass @ np.log(np.maximum(frame.scales, 1e-12) / np.maximum(self._reference.scales, 1e-12))
         opaque = [self._mass @ cloud.opacities.astype(np.float64) for cloud in (frame, self._reference)]
         return GaussianCloud(
-            positions=places,
+            positions=places.astype(np.float32),
             orientations=(turn * Rotation.from_quat(self._orientations)).as_quat(),
-            scales=self._scales * np.exp(stretch.mean(axis=1, keepdims=True)),
+            scales=self._scales * np.exp(np.asarray(stretch).mean(axis=1, keepdims=True)),
             opacities=np.clip(-np.expm1(-self._depth) * opaque[0] / np.maximum(opaque[1], 1e-9), 0.0, 1.0),
             axes=frame.axes,
             radiance_color_space=frame.radiance_color_space,
@@ -146,16 +146,17 @@ def changed(cloud: GaussianCloud, turn: Rotation, changes: Changes) -> GaussianC
         changes: See `Changes`.
     """
     own = Rotation.from_quat(cloud.orientations) * Rotation.from_quat(changes.turn)
+    materials = {name: cast("FloatArray", getattr(cloud, name)) for name in MATERIAL_CHANNELS}
     color, rough, occlusion, lean = np.split(changes.materials, (3, 4, 5), axis=1)
     return cloud.with_arrays(
         positions=cloud.positions + turn.apply(changes.shift),
         orientations=own.as_quat(),
         scales=cloud.scales * np.exp(changes.stretch),
         opacities=sigmoid(logit_of(cloud.opacities.astype(np.float64)) + changes.logit),
-        base_color=np.clip(cloud.base_color + color, 0.0, 1.0),
-        roughness=np.clip(cloud.roughness + rough[:, 0], 0.0, 1.0),
-        ambient_occlusion=np.clip(cloud.ambient_occlusion + occlusion[:, 0], 0.0, 1.0),
-        normals=unit(cloud.normals + turn.apply(lean), cloud.normals),  # type: ignore[operator, arg-type]
+        base_color=np.clip(materials["base_color"] + color, 0.0, 1.0),
+        roughness=np.clip(materials["roughness"] + rough[:, 0], 0.0, 1.0),
+        ambient_occlusion=np.clip(materials["ambient_occlusion"] + occlusion[:, 0], 0.0, 1.0),
+        normals=unit(materials["normals"] + turn.apply(lean), materials["normals"]),
     )
 
 

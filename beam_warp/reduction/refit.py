@@ -16,7 +16,7 @@ from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianGradients, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reduction.moments import Changes, changed
-from beam_warp.reduction.sensitivity import COLUMNS, MATERIALS, SeenView, Sensitivity, material_rows, pixel_sums
+from beam_warp.reduction.sensitivity import COLUMNS, MATERIALS, Sensitivity, material_rows, pixel_sums
 from beam_warp.world.gaussians import GaussianCloud
 
 RATES = {"shift": 0.05, "turn": 0.01, "stretch": 0.02, "logit": 0.05, "materials": 0.005}
@@ -36,7 +36,7 @@ def refit(
     device: Any,
     progress: StageProgress = no_progress,
 ) -> Changes:
-    """Find the changes of merged Gaussians that bring them closest to the original, by the quadratic forms of its views.
+    """Find the changes of merged Gaussians that bring them closest to the original, by the forms of its views.
 
     Args:
         frames: Merged Gaussians of the frames that views are of, and how they are turned since the reference.
@@ -48,7 +48,7 @@ def refit(
     """
     count = len(next(iter(frames.values()))[0])
     values = {name: wp.zeros((count, width), dtype=float, device=device) for name, width in WIDTHS.items()}
-    values["turn"].assign(np.tile(np.float32([0.0, 0.0, 0.0, 1.0]), (count, 1)))
+    values["turn"].assign(np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1)))
     slopes = {name: wp.zeros_like(array) for name, array in values.items()}
     some, _ = next(iter(frames.values()))
     rates = RATES | {"shift": RATES["shift"] * float(np.median(np.sort(some.scales, axis=1)[:, 1]))}

@@ -126,15 +126,15 @@ def measure_sensitivity(
         progress: Called with (stage, done, total).
     """
     meter = _Meter(sequence, trials, raster, resolve_device(device))
-    views, totals, pixels = [], 0.0, []
+    count = len(TRIANGLE[0])
+    views, totals, pixels = [], np.zeros((len(sequence[0]), 48), np.float32), []
     for number, trial in enumerate(cameras):
         progress("measure sensitivity", number, len(cameras))
         some = [lights[(number * LIGHTS + k) % len(lights)] for k in range(LIGHTS)]
         view, carried, pixel = meter.view(trial, some)
         views.append(view)
         pixels.append(pixel)
-        totals = totals + carried
-    count = len(TRIANGLE[0])
+        totals += carried
     materials = np.zeros((len(totals), MATERIALS, MATERIALS), np.float32)
     materials[:, TRIANGLE[0], TRIANGLE[1]] = materials[:, TRIANGLE[1], TRIANGLE[0]] = totals[:, :count]
     return Sensitivity(tuple(views), totals[:, count + 1], totals[:, count], materials, float(np.mean(pixels)))
