@@ -10,8 +10,8 @@ Every rival keeps or makes the same number of Gaussians, and is measured as it i
 - uniform random;
 - splat-transform --decimate-adaptive, of npm; its Gaussians take the mean materials of the originals nearest to each.
 
-Assets are the demo's figure, and Gaussians on the true meshes of captures in $BEAM_DATA whose colours, solved from their
-images, stand for base colours. Defaults were chosen on the figure alone.
+Assets are the demo's figure, and Gaussians on the true meshes of captures in $BEAM_DATA whose colours, solved from
+their images, stand for base colours. Defaults were chosen on the figure alone.
 """
 
 from __future__ import annotations
