@@ -201,7 +201,8 @@ def measured_again(
         return Measured(CERTIFIED.id, False, 0.0, 1.0, "an asset that was changed since")
     if original is None:
         return Measured.absent(CERTIFIED, "--original must name what the asset was reduced from")
-    trials = RelitTrials(environments, height=stated.distribution["height"], seed=stated.distribution["seed"])
+    told = {name: stated.distribution[name] for name in ("height", "seed")}
+    trials = RelitTrials(environments, **told, device=device)
     for name, there, here in (
         ("original", stated.original, asset_digest(original)),
         ("environment", stated.distribution["environments"], trials.describe()["environments"]),

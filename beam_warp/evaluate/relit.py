@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from beam_warp.errors import MissingPackageError
 from beam_warp.evaluate.perceptual import Measure, PerceptualMetrics
 from beam_warp.evaluate.trials import RelitTrials, Trial
-from beam_warp.image.metrics import as_compared, psnr
-from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.image.color import linear_to_srgb
+from beam_warp.image.metrics import bounding_box, psnr
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import DeferredOptions
@@ -84,9 +84,8 @@ class RelitComparison:
         self.original, self.trials = original, trials
         self._flip = require_flip() if measure == "flip" else None
         options = raster or RasterOptions.from_metadata(original.metadata)
-        prepared = [PreparedEnvironment(light, device) for light in trials.environments]
         self._renderers = [
-            DeferredRenderer(COMPARED, raster=options, device=device, prepared=prepared) for _ in range(2)
+            DeferredRenderer(COMPARED, raster=options, device=device, prepared=trials.prepared) for _ in range(2)
         ]
         self._kept: dict[Trial, RenderedImage] = {}
 
@@ -113,12 +112,9 @@ class RelitComparison:
             if keep:
                 self._kept[trial] = truth
         found = self._renderers[1].draw(self.trials.shot(trial, cloud, original))
-        compared = as_compared(
-            found.rgb, truth.rgb, alpha=found.alpha, truth_alpha=truth.alpha, is_color=True, premultiplied=True
-        )
-        images = (np.ascontiguousarray(each, np.float32) for each in (compared.image, compared.truth))
-        flip = np.nan if self._flip is None else self._flip(*images)
-        return psnr(compared.image, compared.truth), flip
+        box = bounding_box(truth.alpha)
+        images = [linear_to_srgb(np.clip(each.rgb[box], 0.0, 1.0)).astype(np.float32) for each in (found, truth)]
+        return psnr(*images), np.nan if self._flip is None else self._flip(images[0], images[1])
 
 
 def require_flip() -> Measure:

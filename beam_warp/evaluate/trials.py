@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from beam_warp.checks import require_count
 from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidOptionError
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.framing import bulk
@@ -74,18 +75,21 @@ class RelitTrials:
     """A distribution of trials.
 
     Attributes:
-        environments: Exposed; then the same dimmed.
+        prepared: Exposed environments on the device; then the same dimmed.
         height: Side of the square images [pixel].
         seed: Same seed, same trials.
     """
 
-    def __init__(self, environments: Sequence[EnvironmentMap], *, height: int = 256, seed: int = 0) -> None:
+    def __init__(
+        self, environments: Sequence[EnvironmentMap], *, height: int = 256, seed: int = 0, device: Any = None
+    ) -> None:
         """Expose the environments.
 
         Args:
             environments: 1 to `MOST_ENVIRONMENTS`, each with light.
             height: Side of the square images [pixel].
             seed: See the class.
+            device: Warp device; None takes the first CUDA device, or the CPU where there is none.
 
         Raises:
             InvalidOptionError: There are none or too many environments, one is black, or a number is out of range.
@@ -96,14 +100,14 @@ class RelitTrials:
             )
         self.height = require_count("height", height, 16, 4096)
         self.seed = require_count("seed", seed, 0, 2**32 - 1)
-        exposed = [_exposed(environment) for environment in environments]
-        self.environments = (*exposed, *(each.scaled(DIMMED) for each in exposed))
+        exposed = [PreparedEnvironment(_exposed(environment), device) for environment in environments]
+        self.prepared = (*exposed, *(each.scaled(DIMMED) for each in exposed))
 
     def describe(self) -> dict[str, object]:
         """Return the distribution as JSON-able facts; lights by their digests."""
-        lights = self.environments[: len(self.environments) // 2]
+        lights = self.prepared[: len(self.prepared) // 2]
         return {
-            "environments": [array_digest(light.radiance)[:16] for light in lights],
+            "environments": [array_digest(light.environment.radiance)[:16] for light in lights],
             "height": self.height,
             "seed": self.seed,
         }
@@ -121,7 +125,7 @@ class RelitTrials:
             frame=int(frames[int(rng.integers(len(frames)))]),
             azimuth=float(rng.uniform(0.0, 360.0)),
             elevation=float(np.degrees(np.arcsin(rng.uniform(low, high)))),
-            environment=int(rng.integers(len(self.environments) // 2)),
+            environment=int(rng.integers(len(self.prepared) // 2)),
             turn=float(rng.uniform(0.0, 360.0)),
             lamp=("none", "none", "sun", "sphere")[int(rng.integers(4))],
             toward=(float(flat * np.cos(around)), float(flat * np.sin(around)), float(up)),
@@ -137,8 +141,8 @@ class RelitTrials:
     def lights(self, trial: Trial, cloud: GaussianCloud) -> tuple[EnvironmentMap, tuple[Light, ...]]:
         """Return the environment of a trial, not yet turned, and the lamp beside it."""
         if trial.lamp == "none":
-            return self.environments[trial.environment], ()
-        dim = self.environments[trial.environment + len(self.environments) // 2]
+            return self.prepared[trial.environment].environment, ()
+        dim = self.prepared[trial.environment + len(self.prepared) // 2].environment
         power = LAMP_WHITE * np.pi
         x, y, z = trial.toward
         if trial.lamp == "sun":

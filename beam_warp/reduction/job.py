@@ -197,7 +197,7 @@ class Reducer:
         _require_reducible(original, clouds, self._frames)
         self._reference, self._clouds = clouds[0], clouds
         self.raster = options.raster or RasterOptions.from_metadata(original.metadata)
-        self.trials = RelitTrials(environments, height=options.height, seed=options.seed)
+        self.trials = RelitTrials(environments, height=options.height, seed=options.seed, device=self._device)
         views = self.trials.draw("search", range(options.views), self._frames)
         lights = self.trials.draw("search", range(options.views, 3 * options.views), self._frames)
         how = {"raster": self.raster, "device": self._device, "progress": progress}

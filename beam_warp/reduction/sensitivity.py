@@ -23,7 +23,7 @@ from beam_warp.image.color import linear_to_srgb
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.render.deferred_pixels import launch_shade_gaussians
-from beam_warp.light.prepared import PreparedEnvironment, PreparedEnvironments
+from beam_warp.light.prepared import PreparedEnvironments
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterImages, RasterOptions
@@ -145,8 +145,7 @@ class _Meter:
 
     def __init__(self, sequence: GaussianSequence, trials: RelitTrials, raster: RasterOptions, device: Any) -> None:
         self._sequence, self._trials, self._raster, self._device = sequence, trials, raster, device
-        prepared = [PreparedEnvironment(light, device) for light in trials.environments]
-        self._environments = PreparedEnvironments(device, prepared)
+        self._environments = PreparedEnvironments(device, trials.prepared)
         self._frame = -1
 
     def _show(self, frame: int) -> None:
