@@ -24,8 +24,11 @@ from beam_warp.world.shot import RenderedImage
 ASSET_PSNR = 35.0
 """PSNR of a good asset's relit images against the truth [dB]."""
 
-COMPARED = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=512, layers=())
-"""How trials are drawn: the split sum with ambient occlusion, and shadow maps of lamps."""
+
+def compared_options(height: int) -> DeferredOptions:
+    """Return how trials of a height [pixel] are drawn: the split sum with ambient occlusion, shadow maps of lamps."""
+    size = int(np.clip(2 * height, 64, 1024))
+    return DeferredOptions(environment_shadows=0, bounces=0, light_map_size=size, layers=())
 
 
 def loss_of(psnr: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -84,8 +87,9 @@ class RelitComparison:
         self.original, self.trials = original, trials
         self._flip = require_flip() if measure == "flip" else None
         options = raster or RasterOptions.from_metadata(original.metadata)
+        shading = compared_options(trials.height)
         self._renderers = [
-            DeferredRenderer(COMPARED, raster=options, device=device, prepared=trials.prepared) for _ in range(2)
+            DeferredRenderer(shading, raster=options, device=device, prepared=trials.prepared) for _ in range(2)
         ]
         self._kept: dict[Trial, RenderedImage] = {}
 

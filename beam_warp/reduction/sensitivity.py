@@ -17,7 +17,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.device.arrays import resolve_device
-from beam_warp.evaluate.relit import COMPARED, world
+from beam_warp.evaluate.relit import world
 from beam_warp.evaluate.trials import RelitTrials, Trial
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.jobs.listeners import StageProgress, no_progress
@@ -29,6 +29,7 @@ from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterImages, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.render.arriving import ArrivingLight
+from beam_warp.render.options import UNSHADOWED
 from beam_warp.render.shadow_maps import ShadowCasters
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud, GaussianSequence
@@ -154,7 +155,7 @@ class _Meter:
             return
         self._frame, self._cloud = frame, world(self._sequence, frame)
         self._gaussians = upload_gaussians(self._cloud, self._device, values=material_rows(self._cloud))
-        self._arriving = ArrivingLight(len(self._cloud), COMPARED, self._environments, self._device)
+        self._arriving = ArrivingLight(len(self._cloud), UNSHADOWED, self._environments, self._device)
         self._casters = ShadowCasters.of(self._cloud)
 
     def view(self, trial: Trial, lights: Sequence[Trial]) -> tuple[SeenView, FloatArray, float]:

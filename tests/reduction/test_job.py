@@ -4,17 +4,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from beam_warp import converters
 from beam_warp.cli.main import main as beam
 from beam_warp.cli.reduce import bytes_of
+from beam_warp.cli.validate import main as beam_validate
 from beam_warp.demo.lights import demo_environments
+from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.evaluate.certificate import KEY, Certificate, asset_digest, measured_again
-from beam_warp.evaluate.relit import RelitComparison
+from beam_warp.evaluate.relit import RelitComparison, compared_options
+from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.files import write_exr
+from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reduction.job import ReduceOptions, Reducer, reduce_asset
+from beam_warp.reduction.sensitivity import LIGHTS as EACH
+from beam_warp.reduction.sensitivity import MATERIALS, material_rows, pixel_sums
+from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 RASTER = RasterOptions(antialiased=True)
@@ -27,18 +36,16 @@ def ball(count: int = 300, frames: int = 1) -> GaussianSequence:
     k = np.arange(count) + 0.5
     z, around = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
     flat, spacing = np.sqrt(1.0 - z * z), np.sqrt(4.0 * np.pi / count)
+    still = np.stack([flat * np.cos(around), flat * np.sin(around), z], axis=1)
+    half = np.stack([-still[:, 1], still[:, 0], np.zeros(count), 1.0 + z], axis=1)
     clouds = []
     for frame in range(frames):
-        turned = around + 0.3 * frame
-        normals = np.stack([flat * np.cos(turned), flat * np.sin(turned), z], axis=1)
-        half = np.stack([-normals[:, 1], normals[:, 0], np.zeros(count), 1.0 + normals[:, 2]], axis=1)
-        spin = np.array([0.0, 0.0, np.sin(0.15 * frame), np.cos(0.15 * frame)])
+        turn = Rotation.from_rotvec([0.0, 0.0, 0.3 * frame])
+        normals = turn.apply(still)
         clouds.append(
             GaussianCloud(
                 positions=normals + np.array([0.0, 0.0, 0.1 * frame]),
-                orientations=_after(half / np.linalg.norm(half, axis=1, keepdims=True), spin)
-                if frame
-                else half / np.linalg.norm(half, axis=1, keepdims=True),
+                orientations=(turn * Rotation.from_quat(half)).as_quat(),
                 scales=np.tile([0.6 * spacing, 0.6 * spacing, 0.05 * spacing], (count, 1)),
                 opacities=np.full(count, 0.95),
                 base_color=np.where(z[:, None] > 0.2, [0.7, 0.2, 0.1], [0.1, 0.3, 0.6]),
@@ -49,12 +56,6 @@ def ball(count: int = 300, frames: int = 1) -> GaussianSequence:
             )
         )
     return GaussianSequence.from_clouds(clouds, metadata=RASTER.as_metadata())
-
-
-def _after(rows: np.ndarray, spin: np.ndarray) -> np.ndarray:
-    from beam_warp.world.quaternions import product
-
-    return product(spin, rows)
 
 
 @pytest.fixture(scope="module")
@@ -68,20 +69,12 @@ def test_quadratic_forms_predict_the_error_of_a_small_change(reducer):
     cloud = reducer.original[0]
     changes = 0.01 * np.random.default_rng(0).normal(size=(len(cloud), 3))
     other = cloud.with_arrays(base_color=np.clip(cloud.base_color + changes, 0.0, 1.0))
-    from beam_warp.device.arrays import resolve_device
-    from beam_warp.evaluate.relit import COMPARED
-    from beam_warp.image.color import linear_to_srgb
-    from beam_warp.raster.rasterizer import Rasterizer
-    from beam_warp.raster.sources import upload_gaussians
-    from beam_warp.reduction.sensitivity import LIGHTS as EACH
-    from beam_warp.reduction.sensitivity import MATERIALS, material_rows, pixel_sums
-    from beam_warp.render.deferred import DeferredRenderer
 
     device = resolve_device("cpu")
     drawer = Rasterizer(len(cloud), [view.camera], value_count=MATERIALS, options=RASTER, device=device)
     sums = pixel_sums(drawer.draw(upload_gaussians(other, device, values=material_rows(other))))
     predicted, _ = view.error(sums)
-    renderer, total = DeferredRenderer(COMPARED, raster=RASTER, device="cpu"), 0.0
+    renderer, total = DeferredRenderer(compared_options(32), raster=RASTER, device="cpu"), 0.0
     trials = reducer.trials.draw("search", range(QUICK.views, QUICK.views + EACH), [0])
     for trial in trials:
         shots = (reducer.trials.shot(trial, each, cloud) for each in (cloud, other))
@@ -111,7 +104,7 @@ def test_the_same_call_gives_the_same_bits(reducer):
     assert asset_digest(again.reduced(50)) == asset_digest(reducer.reduced(50))
 
 
-@pytest.mark.parametrize("name", ["small.usda", "small.b4d"])
+@pytest.mark.parametrize("name", ["small.usda", pytest.param("small.b4d", marks=pytest.mark.slow)])
 def test_a_moving_asset_is_certified_as_it_is_stored(name, tmp_path):
     original = ball(200, frames=3)
     found = reduce_asset(original, LIGHTS, replace(QUICK, gaussians=40), tmp_path / name)
@@ -132,6 +125,7 @@ def test_a_moving_asset_is_certified_as_it_is_stored(name, tmp_path):
             measured_again(back, back, LIGHTS, device="cpu")
 
 
+@pytest.mark.slow
 def test_a_size_is_kept(tmp_path):
     original = ball()
     converters.write(original, tmp_path / "all.b4d")
@@ -196,28 +190,17 @@ def test_assets_that_cannot_be_reduced_are_refused(tmp_path):
         reduce_asset(moving, LIGHTS, QUICK, tmp_path / "small.ply")
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_the_validator_accepts(tmp_path, capsys):
     converters.write(ball(), tmp_path / "all.usda")
     bright = LIGHTS[0].radiance
     write_exr(tmp_path / "light.exr", {name: bright[..., index] for index, name in enumerate("RGB")})
-    words = [
-        "--environment",
-        str(tmp_path / "light.exr"),
-        "--gaussians",
-        "60",
-        "--height",
-        "32",
-        "--views",
-        "4",
-        "--steps",
-        "4",
-        "--pairs",
-        "6",
-        "--device",
-        "cpu",
-    ]
+    words = f"--environment {tmp_path / 'light.exr'} --gaussians 60 --height 32 --views 4 --steps 4 --pairs 6".split()
     assert beam(["reduce", str(tmp_path / "all.usda"), "--out", str(tmp_path / "small.usda"), *words]) == 0
     assert "60 of 300 Gaussians" in capsys.readouterr().out
     assert KEY in converters.read(tmp_path / "small.usda").metadata
+    words = [str(tmp_path / "small.usda"), "--physical", "--original", str(tmp_path / "all.usda")]
+    beam_validate([*words, "--environment", str(tmp_path / "light.exr")])
+    assert "holds   BEAM-PHYS-007" in capsys.readouterr().out
     assert beam(["reduce", str(tmp_path / "all.usda"), "--out", str(tmp_path / "small.usda")]) == 2
     assert capsys.readouterr().err.startswith("error: target must be one of")
