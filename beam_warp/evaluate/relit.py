@@ -118,7 +118,8 @@ class RelitComparison:
         found = self._renderers[1].draw(self.trials.shot(trial, cloud, original))
         box = bounding_box(truth.alpha)
         images = [linear_to_srgb(np.clip(each.rgb[box], 0.0, 1.0)).astype(np.float32) for each in (found, truth)]
-        return psnr(*images), np.nan if self._flip is None else self._flip(images[0], images[1])
+        shown, wanted = images
+        return psnr(shown, wanted), np.nan if self._flip is None else self._flip(shown, wanted)
 
 
 def require_flip() -> Measure:

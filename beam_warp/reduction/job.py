@@ -16,7 +16,7 @@ from beam_warp.converters.formats import format_of
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.evaluate.certificate import MOST_PAIRS, Certificate, certify
-from beam_warp.evaluate.relit import RelitComparison, world
+from beam_warp.evaluate.relit import RelitComparison, require_flip, world
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
@@ -145,7 +145,7 @@ class Reduction:
     """What a reduction found.
 
     Attributes:
-        sequence: The reduced asset, as it is written.
+        count: Gaussians of the reduced asset.
         certificate: What is known of its errors.
         paths: The files written.
         original_count: Gaussians of the original.
@@ -153,17 +153,12 @@ class Reduction:
         error_scale: Factor of the bounds of delivery; None for other containers.
     """
 
-    sequence: GaussianSequence
+    count: int
     certificate: Certificate
     paths: tuple[Path, ...]
     original_count: int
     candidates: tuple[tuple[int, float], ...]
     error_scale: float | None
-
-    @property
-    def count(self) -> int:
-        """Gaussians of the reduced asset."""
-        return len(self.sequence[0])
 
 
 class Reducer:
@@ -258,10 +253,13 @@ def reduce_asset(
     Raises:
         InvalidOptionError: The suffix is another one, or the target cannot be attained; else as `Reducer`.
         InvalidArrayError: As `Reducer`.
+        MissingPackageError: FLIP is bounded and cannot be measured here.
         OutputError: The file cannot be written.
     """
     if format_of(out).name not in ("USD", "b4d"):
         raise InvalidOptionError(f"out must be a file of USD or b4d, got {out.name}. Only these hold a certificate.")
+    if options.measure == "flip":
+        require_flip()
     reducer = Reducer(original, environments, options, progress)
     how = {"raster": reducer.raster, "measure": options.measure, "device": options.device}
     comparison = RelitComparison(original, reducer.trials, **how)
@@ -281,7 +279,7 @@ def reduce_asset(
             )
         final = replace(search.candidate(count), metadata={**original.metadata, **made.as_metadata()})
         paths = converters.write(final, out, _written_as(scale))
-    return Reduction(stored, made, tuple(paths), len(reducer), tuple(search.tried), scale)
+    return Reduction(count, made, tuple(paths), len(reducer), tuple(search.tried), scale)
 
 
 def _certified(
