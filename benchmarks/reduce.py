@@ -235,7 +235,7 @@ def main() -> int:
     record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    count, height, tests, views, steps = (140_000, 320, 64, 96, 600) if device.is_cuda else (4_000, 60, 16, 24, 100)
+    count, height, tests, views, steps = (140_000, 320, 64, 96, 600) if device.is_cuda else (3_000, 56, 12, 20, 80)
     if arguments.quick:
         arguments.assets, count, height, tests, views, steps = ["figure"], 800, 48, 4, 4, 4
     options = ReduceOptions(gaussians=1, height=height, views=views, steps=steps, device=device)
