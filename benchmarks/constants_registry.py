@@ -226,6 +226,8 @@ MESHING = (
 
 MATERIALS = (
     Constant("beam_warp.materials.direct:MaterialOptions.sample_count", BOTH, "Rays of a Gaussian.", more=2.0),
+    Constant("beam_warp.materials.direct:MaterialOptions.light_error", BOTH, "Error at which rays are as many."),
+    Constant("beam_warp.materials.pilot:REACH", BOTH, "Neighbours whose rays tell how many a Gaussian needs."),
     Constant("beam_warp.materials.direct:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
     Constant("beam_warp.materials.normals:LIFT_IN_REACHES", BOTH, "Lift of rays, in reaches of the Gaussians above."),
@@ -497,6 +499,7 @@ UNTUNED = {
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
         beam_warp.materials.light_turn: TURNS
+        beam_warp.materials.pilot: RATE SHARE
         beam_warp.reconstruction.masks: FEWEST_VIEWS SIDE SAMPLES WINDOW
         beam_warp.reconstruction.rig: MOST_LEFT_OUT
         beam_warp.reconstruction.photometry: CHANCE COSINES
@@ -550,6 +553,7 @@ UNTUNED = {
         beam_warp.materials.base_color: PAIRED PAIR_GROUPS MISSING
         beam_warp.materials.changes: LEAST_ERROR
         beam_warp.materials.evidence: SURFACE_CHANNELS PIXELS_AT_ONCE CUTTING_THREADS MARGIN
+        beam_warp.materials.direct: FEWEST_FIRST_RAYS
         beam_warp.materials.exposure: ASKED
         beam_warp.materials.images: UNLIT_PART WHOLE_ALPHA CROP_MARGIN UNSEEN_EVIDENCE
         beam_warp.materials.light: ASKED MOST_VIEWS NEAR

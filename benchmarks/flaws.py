@@ -31,7 +31,7 @@ from parts import Row
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.corrections import RigCorrection, move_between, read_corrections
+from beam_warp.capture.corrections import RigCorrection, move_between
 from beam_warp.capture.findings import Finding
 from beam_warp.cli.reconstruct import Modelling
 from beam_warp.cli.run import Run
@@ -120,7 +120,7 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     said = [*reconstruction["findings"], *decomposition["findings"]]
     said += [finding for frame in reconstruction["frames"] for finding in frame["findings"]]
     row |= told(copy, name, [Finding(**finding) for finding in said])
-    rig = read_corrections(out / "reconstruction")
+    rig = RigCorrection.read(out / "reconstruction")
     surface = converters.read(out / "asset.usda")[0]
     row["recovered"] = recovered(copy, reconstruction, decomposition)
     row["recovered"] |= recovered_poses(clean, copy.capture, rig, change_axes(surface, "rfu").positions)

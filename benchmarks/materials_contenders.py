@@ -121,7 +121,13 @@ OURS = Choices()
 
 DIRECT_AS_PAPER = Choices(
     MaterialOptions(
-        sampler="iid", density="cosine", ratio=False, bounce=False, robust=False, diffuse_weight="fresnel_hv"
+        light_error=0.0,
+        sampler="iid",
+        density="cosine",
+        ratio=False,
+        bounce=False,
+        robust=False,
+        diffuse_weight="fresnel_hv",
     ),
     offset=0.02,
     observed="images",
@@ -244,6 +250,7 @@ def ablation_rows(high: int = 512, low: int = 8) -> list[AblationRow]:
         ("+ bounce", {"bounce": True}),
         ("+ fit and difference", {"observed": "difference"}),
         ("+ robust", {"robust": True}),
+        ("+ rays where light is noisy", {"light_error": MaterialOptions().light_error}),
         ("+ all frames", {"joint": True}),
     ):
         choices = choices.but(**changes)
@@ -261,8 +268,9 @@ def ablation_rows(high: int = 512, low: int = 8) -> list[AblationRow]:
         ("without bounce", {"bounce": False}),
         ("images for fit and difference", {"observed": "images"}),
         ("plain for robust least squares", {"robust": False}),
-        ("16 rays", {"sample_count": 16}),
-        ("256 rays", {"sample_count": 256}),
+        ("as many rays for each", {"light_error": 0.0}),
+        ("16 rays for each", {"sample_count": 16, "light_error": 0.0}),
+        ("256 rays for each", {"sample_count": 256, "light_error": 0.0}),
     ):
         rows.append(_direct("one idea taken away", name, alone.but(**changes)))
     for name, options in (

@@ -86,7 +86,7 @@ def perfect_materials(bench: Bench, perfect: PerfectFrame, truth: TruthViews) ->
             points,
             rough[row.roughness],
             light,
-            options=MaterialOptions(bounce=row.bounce, sample_count=row.rays),
+            options=MaterialOptions(bounce=row.bounce, sample_count=row.rays, light_error=0.0),
             views=perfect.evidence if row.observed == "difference" else spread,
         )
         solved = solve_base_color(

@@ -13,6 +13,7 @@ import functools
 import hashlib
 import io
 import json
+import re
 import subprocess
 import sys
 import tokenize
@@ -73,15 +74,29 @@ def write_result(arguments: argparse.Namespace, device: Any, result: Mapping[str
     }
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     partial = arguments.out.with_suffix(".partial")
-    partial.write_text(json.dumps({"measured": head, **result}, indent=1, default=_plain) + "\n", encoding="utf-8")
+    partial.write_text(as_text({"measured": head, **result}), encoding="utf-8")
     partial.replace(arguments.out)
 
 
+def as_text(result: Mapping[str, Any]) -> str:
+    """Return a result as JSON: what holds nothing further stands on one line, numbers have eight digits."""
+    text = json.dumps(_plain(result), indent=1)
+    return re.sub(r"[\[{][^\[\]{}]*[\]}]", lambda found: re.sub(r"\n *", " ", found[0]), text) + "\n"
+
+
 def _plain(value: Any) -> Any:
-    """Return what JSON does not know as it has it: NumPy's numbers and arrays, paths by their last part."""
+    """Return what JSON has: NumPy's numbers and arrays as lists, paths by their last part, numbers of eight digits."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return float(f"{value:.8g}")
+    if value is None or isinstance(value, str | int):
+        return value
     if isinstance(value, Path):
         return value.name
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+    return _plain(value.tolist()) if hasattr(value, "tolist") else str(value)
 
 
 def commit() -> str:

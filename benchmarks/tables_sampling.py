@@ -7,7 +7,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from tables import Row, Rows, figure, number, step, table
+import numpy as np
+from tables import Row, Rows, figure, number, slug, step, table
 
 from beam_warp.study.picture import write_image
 from beam_warp.study.table import read_table
@@ -32,6 +33,52 @@ def sampling_irradiance(ball: Row, human: Row) -> Rows:
     rows: list[list[Any]] = [["", *(f"{name}: {sky['peak_over_mean']:,.0f}" for name, sky in skies)]]
     for place, row in enumerate(skies[0][1]["rows"]):
         rows.append([row["name"], *(f"{sky['rows'][place]['relative_rmse']:.3f}" for _, sky in skies)])
+    return rows
+
+
+@table("economy_light", "economy_cpu.json")
+def economy_light(result: Row) -> Rows:
+    """Light by rays for each Gaussian and by target, on every subject."""
+    rows: list[list[Any]] = [
+        ["", "rays", "error", "the same for each", "mean error", "stopped by itself", "faster", "base colour"]
+    ]
+    for name, found in result["captures"].items():
+        same, *others = (row for row in found["light"]["rows"] if "scores" in row)
+        words = [f"{name}, {same['name']}", f"{same['rays']}", f"{100 * same['rmse']:.1f} %", ""]
+        rows.append(
+            [*words, f"{same['mean_in_standard_errors']:+.1f}", "", "", f"{same['scores']['base_color']:.2f} dB"]
+        )
+        errors = [math.log(row["rmse"]) for row in others]
+        rays, faster = (
+            float(np.interp(math.log(same["rmse"]), errors, [row[key] for row in others])) for key in ("rays", "faster")
+        )
+        rows.append(
+            [f"{name}, at that error", f"{rays:.0f}", words[2], f"{same['rays']}", "", "", f"{faster:.2f} ×", ""]
+        )
+        for row, alone in zip(others, found["light"]["stopped"], strict=True):
+            rows.append(
+                [
+                    f"{name}, {row['name'].replace('target', 'light_error')}",
+                    f"{row['rays']:.0f}",
+                    f"{100 * row['rmse']:.1f} %",
+                    f"{row['equal_rays']:.0f}",
+                    f"{row['mean_in_standard_errors']:+.1f}",
+                    f"{alone['mean_in_standard_errors']:+.1f}",
+                    f"{row['faster']:.2f} ×",
+                    f"{row['scores']['base_color']:.2f} dB",
+                ]
+            )
+    return rows
+
+
+@table("economy_occlusion", "economy_cpu.json")
+def economy_occlusion(result: Row) -> Rows:
+    """Occlusion by the same rule, on every subject."""
+    rows: list[list[Any]] = [["rays (the same for each)", *result["captures"]]]
+    targets = [row["name"] for row in next(iter(result["captures"].values()))["occlusion"] if "equal_rays" in row]
+    for target in targets:
+        found = [step(subject["occlusion"], slug(target)) for subject in result["captures"].values()]
+        rows.append([target, *(f"{row['rays']:.0f} ({row['equal_rays']:.0f})" for row in found)])
     return rows
 
 

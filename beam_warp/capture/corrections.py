@@ -9,25 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.capture.capture import CaptureRecord
 from beam_warp.capture.findings import Finding, count_of, names_of
-from beam_warp.capture.inspect import SPLIT
-from beam_warp.capture.records import read_json
+from beam_warp.capture.side_file import SideFile
 from beam_warp.checks import require_array, require_finite, require_number
-from beam_warp.errors import AssetFormatError, BeamError
 from beam_warp.world.camera import Camera
-
-FILE_NAME = "cameras.json"
-
-MOST_BYTES = 2**26
-"""Most bytes of a file of corrections; a camera has some 500."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +74,7 @@ class CameraCorrection:
 
 
 @dataclass(frozen=True)
-class RigCorrection:
+class RigCorrection(SideFile):
     """Corrections of the cameras of a rig.
 
     Attributes:
@@ -93,6 +85,9 @@ class RigCorrection:
         world: The motion of the world that was taken out of the corrections, because no photograph tells it: turn
             [rad], shift [m] and the logarithm of scale, about the subject's middle, ``(7,)``.
     """
+
+    FILE = "cameras.json"
+    SUBJECT = "corrections of cameras"
 
     cameras: tuple[CameraCorrection, ...]
     is_applied: bool
@@ -122,24 +117,12 @@ class RigCorrection:
         """Root mean square over the cameras of the standard errors [pixel]."""
         return _root_mean_square([camera.error for camera in self.cameras])
 
-    def corrected(self, records: Sequence[CaptureRecord]) -> tuple[CaptureRecord, ...]:
-        """Return records with their cameras corrected, those of cameras that are left out missing.
-
-        Records of other splits than training, and of cameras that the rig has not, stay as they are.
-        """
-        by_name = {camera.camera: camera for camera in self.cameras}
-        kept = []
-        for record in records:
-            found = by_name.get(record.camera_name) if record.split == SPLIT else None
-            if found is None:
-                kept.append(record)
-            elif found.is_used:
-                kept.append(replace(record, camera=found.applied(record.camera)) if self.is_applied else record)
-        return tuple(kept)
-
-    def capture(self, capture: Capture) -> Capture:
-        """Return the capture with its training cameras corrected."""
-        return Capture(**{**vars(capture), "records": self.corrected(capture.records)})
+    def put_right(self, record: CaptureRecord) -> CaptureRecord | None:
+        """Return a record with its camera corrected; None if the camera is left out, itself if the rig has it not."""
+        found = next((camera for camera in self.cameras if camera.camera == record.camera_name), None)
+        if found is not None and not found.is_used:
+            return None
+        return record if found is None or not self.is_applied else replace(record, camera=found.applied(record.camera))
 
     def summary(self) -> str:
         """Return what was moved, and how sure that is, in one line."""
@@ -181,7 +164,7 @@ class RigCorrection:
         return found
 
     def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-able record, which `from_dict` reads."""
+        """Return a JSON-able record, which `from_dict` takes."""
         return {
             "is_applied": self.is_applied,
             "confidence": self.confidence,
@@ -193,44 +176,17 @@ class RigCorrection:
         }
 
     @classmethod
-    def from_dict(cls, content: Any, where: Path) -> RigCorrection:
-        """Read what `as_dict` returned.
-
-        Raises:
-            AssetFormatError: A field is missing or out of range.
-        """
-        try:
-            cameras = tuple(CameraCorrection(**camera) for camera in content["cameras"])
-            confidence = require_number("confidence", content["confidence"], 0.0)
-            world = require_array("world", content.get("world", (0.0,) * 7), (7,), np.float64)
-            require_finite("world", world)
-            kinds = tuple(str(kind) for kind in content.get("kinds", ()))
-            return cls(cameras, bool(content["is_applied"]), confidence, kinds, tuple(world.tolist()))
-        except (BeamError, KeyError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise AssetFormatError(
-                f"corrections of cameras must be as beam reconstruct wrote them, got {reason} at {where}. Delete the "
-                "file to find them again."
-            ) from error
-
-
-def read_corrections(folder: Path) -> RigCorrection | None:
-    """Read the corrections beside a reconstruction.
-
-    Args:
-        folder: Folder of the reconstruction.
-
-    Returns:
-        The corrections; None if there are none.
-
-    Raises:
-        AssetFormatError: The file is damaged.
-    """
-    path = folder / FILE_NAME
-    if not path.is_file():
-        return None
-    content = read_json(path, "corrections of cameras", MOST_BYTES)
-    return RigCorrection.from_dict(content, path)
+    def from_dict(cls, content: Any) -> RigCorrection:
+        """Take what `as_dict` returned."""
+        world = require_array("world", content.get("world", (0.0,) * 7), (7,), np.float64)
+        require_finite("world", world)
+        return cls(
+            tuple(CameraCorrection(**camera) for camera in content["cameras"]),
+            bool(content["is_applied"]),
+            require_number("confidence", content["confidence"], 0.0),
+            tuple(str(kind) for kind in content.get("kinds", ())),
+            tuple(world.tolist()),
+        )
 
 
 def moved_camera(camera: Camera, move: ArrayLike) -> Camera:

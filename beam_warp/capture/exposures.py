@@ -7,24 +7,16 @@ goes back to the photographs later sees the colours that the Gaussians were fitt
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.capture.capture import CaptureRecord
 from beam_warp.capture.findings import Finding
-from beam_warp.capture.inspect import SPLIT
-from beam_warp.capture.records import read_json
+from beam_warp.capture.side_file import SideFile
 from beam_warp.checks import require_array, require_finite, require_number
-from beam_warp.errors import AssetFormatError, BeamError
-
-FILE_NAME = "exposures.json"
-
-MOST_BYTES = 2**26
-"""Most bytes of a file of exposures; a camera has some 300."""
 
 NEUTRAL = (1.0, 1.0, 1.0)
 
@@ -57,7 +49,7 @@ class CameraExposure:
 
 
 @dataclass(frozen=True)
-class RigExposures:
+class RigExposures(SideFile):
     """Exposures and white balances of the cameras of a rig.
 
     Attributes:
@@ -68,25 +60,19 @@ class RigExposures:
         balance_undone: Likewise of white balance.
     """
 
+    FILE = "exposures.json"
+    SUBJECT = "exposures of cameras"
+
     cameras: tuple[CameraExposure, ...]
     exposure_error: float = 0.0
     balance_error: float = 0.0
     exposure_undone: bool = False
     balance_undone: bool = False
 
-    def corrected(self, records: Sequence[CaptureRecord]) -> tuple[CaptureRecord, ...]:
-        """Return records whose views are without the gains of their cameras; those of other splits stay."""
-        gains = {found.camera: found.gains for found in self.cameras if found.gains != NEUTRAL}
-        return tuple(
-            replace(record, gains=gains[record.camera_name])
-            if record.split == SPLIT and record.camera_name in gains
-            else record
-            for record in records
-        )
-
-    def capture(self, capture: Capture) -> Capture:
-        """Return the capture with its training images corrected."""
-        return Capture(**{**vars(capture), "records": self.corrected(capture.records)})
+    def put_right(self, record: CaptureRecord) -> CaptureRecord:
+        """Return a record whose views are without the gains of its camera."""
+        gains = next((found.gains for found in self.cameras if found.camera == record.camera_name), NEUTRAL)
+        return record if gains == NEUTRAL else replace(record, gains=gains)
 
     def findings(self) -> list[Finding]:
         """Return what a user should know."""
@@ -107,46 +93,12 @@ class RigExposures:
             found.append(Finding("warning", "camera-white-balance", what, most.camera, "Match white balances before."))
         return found
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-able record, which `from_dict` reads."""
-        return asdict(self)
-
     @classmethod
-    def from_dict(cls, content: Any, where: Path) -> RigExposures:
-        """Read what `as_dict` returned.
-
-        Raises:
-            AssetFormatError: A field is missing or out of range.
-        """
-        try:
-            cameras = tuple(CameraExposure(**camera) for camera in content["cameras"])
-            errors = {name: require_number(name, content[name], 0.0) for name in ("exposure_error", "balance_error")}
-            undone = {name: bool(content[name]) for name in ("exposure_undone", "balance_undone")}
-            return cls(cameras, **errors, **undone)
-        except (BeamError, KeyError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise AssetFormatError(
-                f"exposures of cameras must be as beam reconstruct wrote them, got {reason} at {where}. Delete the "
-                "file to find them again."
-            ) from error
-
-
-def read_exposures(folder: Path) -> RigExposures | None:
-    """Read the exposures beside a reconstruction.
-
-    Args:
-        folder: Folder of the reconstruction.
-
-    Returns:
-        The exposures; None if there are none.
-
-    Raises:
-        AssetFormatError: The file is damaged.
-    """
-    path = folder / FILE_NAME
-    if not path.is_file():
-        return None
-    return RigExposures.from_dict(read_json(path, "exposures of cameras", MOST_BYTES), path)
+    def from_dict(cls, content: Any) -> RigExposures:
+        """Take what `as_dict` returned."""
+        cameras = tuple(CameraExposure(**camera) for camera in content["cameras"])
+        errors = {name: require_number(name, content[name], 0.0) for name in ("exposure_error", "balance_error")}
+        return cls(cameras, **errors, **{name: bool(content[name]) for name in ("exposure_undone", "balance_undone")})
 
 
 def _spread(values: ArrayLike) -> float:

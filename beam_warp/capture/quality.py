@@ -157,7 +157,8 @@ def _deviations(variances: NDArray[np.float64], normals: NDArray[np.float64]) ->
     least = [np.quantile(variances[sector == index], QUARTILE) for index in told]
     row, column = (function((np.array(told) + 0.5) * (np.pi / DIRECTIONS)) for function in (np.sin, np.cos))
     yy, xy, xx = np.linalg.lstsq(np.stack([row**2, 2.0 * row * column, column**2], axis=1), least, rcond=None)[0]
-    small, large = np.sqrt(np.maximum(np.linalg.eigvalsh([[yy, xy], [xy, xx]]), 0.0))
+    # directions without edges say nothing: no variance is larger than that of the widest edges that were seen
+    small, large = np.sqrt(np.clip(np.linalg.eigvalsh([[yy, xy], [xy, xx]]), 0.0, max(*least, 0.0)))
     return float(small), float(large)
 
 

@@ -11,9 +11,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.corrections import read_corrections
-from beam_warp.capture.exposures import read_exposures
-from beam_warp.capture.mask_corrections import read_mask_corrections
+from beam_warp.capture.corrections import RigCorrection
+from beam_warp.capture.exposures import RigExposures
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, Seed
 from beam_warp.cli.common.pages import SECOND_PAGE
@@ -62,7 +62,11 @@ class Measuring:
         SECOND_PAGE,
     ] = None
     samples: Annotated[
-        int | None, arg(metavar="N", help="Rays per Gaussian for visibility, and as many for light; 64 by default.")
+        int | None,
+        arg(
+            metavar="N",
+            help="Rays per Gaussian for visibility; light takes more or fewer, as it is noisy. 64 by default.",
+        ),
     ] = None
     offset: Annotated[
         float | Literal["auto"] | None,
@@ -137,8 +141,8 @@ def decompose(args: Decompose) -> int:
 
 def _seen_by(capture: Capture, sequence: Path) -> Capture:
     """Return a capture with the cameras, masks and colours that a reconstruction's sequence was fitted with."""
-    for read in (read_mask_corrections, read_corrections, read_exposures):
-        found = read(sequence.parent)
+    for kind in (MaskCorrections, RigCorrection, RigExposures):
+        found = kind.read(sequence.parent)
         capture = capture if found is None else found.capture(capture)
     return capture
 

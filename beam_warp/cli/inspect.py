@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.corrections import FILE_NAME, RigCorrection, read_corrections
+from beam_warp.capture.corrections import RigCorrection
 from beam_warp.capture.inspect import MAX_IMAGES, inspect_capture
 from beam_warp.capture.page import write_page
 from beam_warp.capture.picture import all_findings, headline, verdict, write_picture
@@ -74,10 +74,10 @@ def inspect(args: Inspect) -> int:
 
 def _corrections(folder: Path) -> RigCorrection:
     """Read the corrections of a reconstruction, or of the one within the folder of `beam run`."""
-    found = read_corrections(folder) or read_corrections(folder / "reconstruction")
+    found = RigCorrection.read(folder) or RigCorrection.read(folder / "reconstruction")
     if found is None:
         raise MissingFileError(
-            f"cameras must be the folder of a reconstruction with {FILE_NAME}, got none in {folder}. Pass what beam "
-            "reconstruct or beam run wrote."
+            f"cameras must be the folder of a reconstruction with {RigCorrection.FILE}, got none in {folder}. Pass "
+            "what beam reconstruct or beam run wrote."
         )
     return found

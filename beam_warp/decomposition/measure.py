@@ -27,12 +27,14 @@ class FrameMeasurement:
         plan: Light and options.
         roughness: ``roughness`` of the frame's Gaussians, ``(N,)``, and ``roughness_error`` where it is estimated.
         ray_count: Rays of light and occlusion that were traced.
+        economy: What fewer rays for some Gaussians have left out; see `beam_warp.materials.pilot.economy`.
         notes: What a reader of the result should know.
     """
 
     plan: JobPlan
     roughness: Mapping[str, NDArray[np.float32]]
     ray_count: int = 0
+    economy: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def measure(self, frame: SeenFrame, previous: MeasuredFrame | None) -> MeasuredFrame:
@@ -67,6 +69,7 @@ class FrameMeasurement:
                 progress=frame.log.within("materials", frame.number),
             )
         self.ray_count += measured.ray_count
+        self.economy = measured.economy
         with frame.log.timer("fill"):
             occlusion, error = frame.filled_occlusion(measured.ambient_occlusion, measured.ambient_occlusion_error)
         arrays = {"ambient_occlusion": occlusion, "ambient_occlusion_error": error, **roughness}

@@ -18,6 +18,7 @@ from beam_warp.decomposition.tally import warnings_about
 from beam_warp.decomposition.work import material_step
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
+from beam_warp.materials.pilot import summary
 from beam_warp.plan.steps import Receipt
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import Relighting, contact_sheet
@@ -33,6 +34,7 @@ class Measurements:
     Attributes:
         resumed: Frames that were found finished.
         ray_count: Rays of light and occlusion that were traced for the others.
+        economy: What fewer rays for some Gaussians have left out, over all frames.
         notes: What a reader of the result should know.
         clipped: Part of the opacity that was cut at 1, of each frame that was solved by itself.
         roughness: How the last estimate of roughness came about; empty if none was made.
@@ -42,6 +44,7 @@ class Measurements:
 
     resumed: int
     ray_count: int
+    economy: dict[str, Any]
     notes: list[str]
     clipped: list[float]
     roughness: dict[str, Any]
@@ -61,7 +64,8 @@ class Measurements:
                 seconds[stage] = seconds.get(stage, 0.0) + spent
         return cls(
             resumed=sum(frame.is_kept for frame in frames),
-            ray_count=sum(frame.facts["rays"] for frame in frames if not frame.is_kept),
+            ray_count=sum(frame.facts["ray_count"] for frame in frames if not frame.is_kept),
+            economy=summary([frame.facts["economy"] for frame in frames]),
             notes=list(dict.fromkeys(note for frame in frames for note in frame.facts["notes"])),
             clipped=[frame.facts.get("clipped", 0.0) for frame in frames],
             roughness=estimates[-1] if estimates else {},
@@ -172,6 +176,7 @@ def run_report(
         "persistent": persistent,
         "materials": solved.statistics,
         "roughness": made.roughness,
+        "economy": made.economy,
         "seconds": {**stages, "total": seconds},
         "light_and_occlusion_rays_per_second": made.ray_count / traced if traced > 0.0 else None,
         "findings": findings,

@@ -250,7 +250,7 @@ class MaterialWork:
         frame.forget()
         if self.solves:
             facts["clipped"] = solve_frame(self.job, measured)
-        return facts | {"rays": measurement.ray_count, "notes": measurement.notes}
+        return facts | {key: getattr(measurement, key) for key in ("ray_count", "economy", "notes")}
 
     def _roughness(self, frame: SeenFrame, facts: dict[str, Any]) -> Mapping[str, NDArray[np.float32]]:
         """Return the roughness of a frame: stated, what all frames share, or its own, whose report joins the facts."""

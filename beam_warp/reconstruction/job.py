@@ -34,12 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp import converters
-from beam_warp.capture import corrections, exposures, mask_corrections
 from beam_warp.capture.capture import Capture, CaptureRecord
-from beam_warp.capture.corrections import read_corrections
-from beam_warp.capture.exposures import read_exposures
+from beam_warp.capture.corrections import RigCorrection
+from beam_warp.capture.exposures import RigExposures
 from beam_warp.capture.findings import Finding
-from beam_warp.capture.mask_corrections import read_mask_corrections
+from beam_warp.capture.mask_corrections import MaskCorrections
+from beam_warp.capture.side_file import SideFile
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
 from beam_warp.converters.staging import require_writable
@@ -106,20 +106,16 @@ Records = Mapping[int, Sequence[CaptureRecord]]
 class Mend(NamedTuple):
     """Something that is found wrong with a capture in its first frame, and is put right in all.
 
-    What is found has ``corrected(records)``, ``capture(capture)``, ``findings()`` and ``as_dict()``.
-
     Attributes:
         stage: Name of its step, of the option by which it is left out ("keep"), and of its entry in the report.
-        file: Name of the file that holds what was found.
-        read: Returns what that file of a folder says; None if there is none.
+        kind: What is found, and its file.
         find: Called with the steps of a frame, names of the cameras, their views and progress; None for nothing.
         is_possible: Whether it can be found in records of these frames.
     """
 
     stage: str
-    file: str
-    read: Callable[[Path], Any]
-    find: Callable[..., Any]
+    kind: type[SideFile]
+    find: Callable[..., SideFile | None]
     is_possible: Callable[[Records], bool]
 
 
@@ -223,7 +219,7 @@ class ReconstructionWork:
                 steps.append(Step(mend.stage, mend.stage, None, first, Rank.SHARED))
                 first = (mend.stage,)
             else:
-                (self.folder / mend.file).unlink(missing_ok=True)
+                (self.folder / mend.kind.FILE).unlink(missing_ok=True)
         for segment in self.frames.segments:
             for frame, previous in zip(segment, (None, *segment), strict=False):
                 inputs = first if previous is None else (frame_step(previous),)
@@ -251,7 +247,7 @@ class ReconstructionWork:
     @cached_property
     def found(self) -> dict[str, Any]:
         """What was found wrong with the capture, by stage, when all of it has been sought."""
-        read = {mend.stage: mend.read(self.folder) for mend in self.mends}
+        read = {mend.stage: mend.kind.read(self.folder) for mend in self.mends}
         return {stage: found for stage, found in read.items() if found is not None}
 
     @cached_property
@@ -278,7 +274,7 @@ class ReconstructionWork:
         """Return the file of a step; there is none where nothing was found wrong."""
         if step.frame is None:
             return tuple(
-                path for mend in MENDS if mend.stage == step.stage and (path := self.folder / mend.file).is_file()
+                path for mend in MENDS if mend.stage == step.stage and (path := self.folder / mend.kind.FILE).is_file()
             )
         return ((self.store.path if step.stage == "frame" else self.store.preview_path)(step.frame),)
 
@@ -320,15 +316,15 @@ class ReconstructionWork:
         """Find something wrong with the capture, what was found before it put right."""
         place = [mend.stage for mend in self.mends].index(stage)
         mend, frame = self.mends[place], next(iter(self.frames.records))
-        known = filter(None, (before.read(self.folder) for before in self.mends[:place]))
+        known = filter(None, (before.kind.read(self.folder) for before in self.mends[:place]))
         records = _corrected({frame: self.frames.records[frame]}, known)
         with FrameReader(records, self.store.digests) as reader:
             names = [record.camera_name for record in records[frame]]
             found = mend.find(self.steps, names, reader.views(frame), within(progress, stage, frame))
         if found is None:
-            (self.folder / mend.file).unlink(missing_ok=True)
+            (self.folder / mend.kind.FILE).unlink(missing_ok=True)
         else:
-            write_json(self.folder / mend.file, found.as_dict())
+            write_json(self.folder / mend.kind.FILE, found.as_dict())
         return {}
 
     def _model(self, step: Step, views: Sequence[CapturedView], progress: NotedProgress) -> dict[str, Any]:
@@ -457,25 +453,12 @@ def _is_fixed_rig(records: Mapping[int, Sequence[CaptureRecord]]) -> bool:
 MENDS = (
     Mend(
         "masks",
-        mask_corrections.FILE_NAME,
-        read_mask_corrections,
+        MaskCorrections,
         lambda steps, *asked: steps.mend_masks(*asked),
         lambda records: _has_own_names(next(iter(records.values()))),
     ),
-    Mend(
-        "cameras",
-        corrections.FILE_NAME,
-        read_corrections,
-        lambda steps, *asked: steps.refine_rig(*asked),
-        _is_fixed_rig,
-    ),
-    Mend(
-        "exposures",
-        exposures.FILE_NAME,
-        read_exposures,
-        lambda steps, *asked: steps.find_exposures(*asked),
-        _is_fixed_rig,
-    ),
+    Mend("cameras", RigCorrection, lambda steps, *asked: steps.refine_rig(*asked), _is_fixed_rig),
+    Mend("exposures", RigExposures, lambda steps, *asked: steps.find_exposures(*asked), _is_fixed_rig),
 )
 """What is put right, in this order: each step sees the capture as those before it left it."""
 

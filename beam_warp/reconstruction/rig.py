@@ -46,8 +46,9 @@ from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.targets import crop_views
 from beam_warp.world.camera import Camera
 
-FEWEST_CAMERAS = 6
-"""Fewest cameras of a rig: of fewer, one or two see most of the surface, and another shape explains their errors."""
+FEWEST_CAMERAS = 8
+"""Fewest cameras of a rig: of fewer, one or two see most of the surface, and another shape explains their errors.
+Inspection warns of the same number."""
 
 CERTAIN = 1.5
 """Corrections that are so many times their standard errors, root mean square over the rig, are made. In exact rigs that

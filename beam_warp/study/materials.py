@@ -271,6 +271,7 @@ class _Bench:
         prepared = self._prepare(str(settings["observed"]), str(settings["offset"]))
         options: dict[str, Any] = {
             "sample_count": settings["rays"],
+            "light_error": 0.0,
             "sampler": settings["sampler"],
             "density": settings["density"],
             "ratio": settings["ratio"] == "ratio",

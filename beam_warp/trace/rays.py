@@ -79,6 +79,7 @@ def ray_batches(
     *,
     stream: tuple[int, int] = (0, 0),
     points_at_once: int | None = None,
+    chosen: wp.array | None = None,
 ) -> list[RayBatch]:
     """Return points in Morton order, so many at a time that their rays are at most `RAYS_AT_ONCE`.
 
@@ -93,11 +94,14 @@ def ray_batches(
         sample_count: Rays a point.
         stream: Seed and number of the frame.
         points_at_once: At most so many points a batch.
+        chosen: Rows of the points that are asked for, ``(K,)`` int; None takes all.
     """
-    count, device = len(points), scene.device
+    at = points if chosen is None else points[chosen].contiguous()
+    count, device = len(at), scene.device
     if count == 0:
         return []
-    rows = morton_order(points, points, wp.ones(count, dtype=int, device=device))[0][:count]
+    rows = morton_order(at, at, wp.ones(count, dtype=int, device=device))[0][:count]
+    rows = rows if chosen is None else chosen[rows].contiguous()
     positions, directions = points[rows].contiguous(), normals[rows].contiguous()
     given: Any = offset
     if isinstance(given, wp.array):

@@ -52,6 +52,7 @@ class Technique:
     samples: SampleSet
     begin: int  # place of its first sample among those of a point
     sample_count: int  # of a point, by all techniques
+    known: int  # of its first samples it is known what they meet: they are not traced
     cosine_share: float  # part of a point's samples that COSINE draws
     environment_share: float  # part that ENVIRONMENT draws
 
@@ -121,6 +122,11 @@ def draw_light(
     return drawn
 
 
+@wp.func
+def light_stream(technique: Technique, point_stream: wp.uint32) -> wp.uint32:
+    return hash_combine(point_stream, LIGHT_STREAM + wp.uint32(technique.density))
+
+
 @wp.kernel
 def draw_light_kernel(
     first: int,
@@ -137,8 +143,8 @@ def draw_light_kernel(
     place = item / technique.samples.count
     normal = batch.normals[place]
     point_stream = stream_of_place(batch, place)
-    stream = hash_combine(point_stream, LIGHT_STREAM + wp.uint32(technique.density))
-    square = draw_square(technique.samples, item % technique.samples.count, stream)
+    index = item % technique.samples.count
+    square = draw_square(technique.samples, index, light_stream(technique, point_stream))
     drawn = draw_light(technique, distribution, blocks, cumulative, place, normal, square.u, square.v)
     weight = radiance_over_pdf(drawn) * (wp.max(wp.dot(normal, drawn.direction), 0.0) / PI)
     begin = place * batch.sample_count
@@ -147,9 +153,33 @@ def draw_light_kernel(
     out_weights[ray] = weight
     out_rays.origins[ray] = ray_origin(batch, place)
     out_rays.directions[ray] = drawn.direction
-    out_rays.reaches[ray] = wp.where(weight[0] + weight[1] + weight[2] > 0.0, float(LARGEST_FLOAT), -1.0)
+    is_traced = weight[0] + weight[1] + weight[2] > 0.0 and index >= technique.known
+    out_rays.reaches[ray] = wp.where(is_traced, float(LARGEST_FLOAT), -1.0)
     if out_rays.streams.shape[0] > 0:
         out_rays.streams[ray] = hash_combine(hash_combine(point_stream, LIGHT_STREAM), wp.uint32(slot))
+
+
+@wp.kernel
+def recall_visibility_kernel(
+    first: int,
+    technique: Technique,
+    pilot: SampleSet,
+    batch: RayBatch,
+    places: wp.array[int],
+    visibility: wp.array[float],
+    out_visibility: wp.array[float],
+):
+    """Put what the first samples of points met where a longer set of the same sequence has them.
+
+    ``visibility`` holds it in the strata of the first samples alone, points in the order of ``places``.
+    """
+    item = first + wp.tid()
+    place = item / pilot.count
+    stream = light_stream(technique, stream_of_place(batch, place))
+    index = item % pilot.count
+    known = places[batch.rows[place]] * pilot.count + draw_square(pilot, index, stream).slot
+    slot = technique.begin + draw_square(technique.samples, index, stream).slot
+    out_visibility[place * batch.sample_count + slot] = visibility[known]
 
 
 @wp.kernel
@@ -223,6 +253,10 @@ def launch_draw_light(technique, environment, cumulative, batch, out_rays, out_w
         device=device,
         block_dim=128,
     )
+
+
+launch_recall_visibility = launcher(recall_visibility_kernel)
+"""Take over what is known of a batch's rays."""
 
 
 launch_reduce_light = launcher(reduce_light_kernel, block_dim=64)

@@ -9,14 +9,7 @@ from scipy.spatial.transform import Rotation
 from support.fake_steps import write_capture
 
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.corrections import (
-    FILE_NAME,
-    CameraCorrection,
-    RigCorrection,
-    move_between,
-    moved_camera,
-    read_corrections,
-)
+from beam_warp.capture.corrections import CameraCorrection, RigCorrection, move_between, moved_camera
 from beam_warp.errors import AssetFormatError, InvalidArrayError
 from beam_warp.world.camera import Camera
 
@@ -75,10 +68,10 @@ def test_findings_name_who_was_moved_and_who_is_left_out():
 
 
 def test_files_come_back_and_damage_is_named(tmp_path):
-    assert read_corrections(tmp_path) is None
-    path = tmp_path / FILE_NAME
+    assert RigCorrection.read(tmp_path) is None
+    path = tmp_path / RigCorrection.FILE
     path.write_text(json.dumps(rig().as_dict()))
-    assert read_corrections(tmp_path) == rig()
+    assert RigCorrection.read(tmp_path) == rig()
     for content in (
         "[]",
         '{"cameras": 3}',
@@ -87,6 +80,6 @@ def test_files_come_back_and_damage_is_named(tmp_path):
     ):
         path.write_text(content)
         with pytest.raises(AssetFormatError, match=r"corrections of cameras must be as beam reconstruct wrote them"):
-            read_corrections(tmp_path)
+            RigCorrection.read(tmp_path)
     with pytest.raises(InvalidArrayError, match="turn must be finite"):
         CameraCorrection("a", turn=(np.nan, 0.0, 0.0))

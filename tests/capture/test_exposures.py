@@ -8,7 +8,7 @@ import pytest
 from support.fake_steps import write_capture
 
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.exposures import FILE_NAME, CameraExposure, RigExposures, read_exposures
+from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.errors import AssetFormatError
 
 FOUND = RigExposures(
@@ -47,12 +47,12 @@ def test_findings_say_how_much_and_who_most():
 
 
 def test_files_come_back_and_damage_is_named(tmp_path):
-    assert read_exposures(tmp_path) is None
-    path = tmp_path / FILE_NAME
+    assert RigExposures.read(tmp_path) is None
+    path = tmp_path / RigExposures.FILE
     path.write_text(json.dumps({"key": "k", **FOUND.as_dict()}))
-    assert read_exposures(tmp_path) == FOUND
+    assert RigExposures.read(tmp_path) == FOUND
     wrong_gain = FOUND.as_dict() | {"cameras": [{"camera": "a", "gains": [0.0, 1.0, 1.0]}]}
     for content in ("[]", '{"cameras": 3}', '{"cameras": []}', json.dumps(wrong_gain)):
         path.write_text(content)
         with pytest.raises(AssetFormatError, match="exposures of cameras must be as beam reconstruct wrote them"):
-            read_exposures(tmp_path)
+            RigExposures.read(tmp_path)

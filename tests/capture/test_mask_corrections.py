@@ -8,7 +8,7 @@ from support.fake_steps import write_capture
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.cutouts import taken_in
-from beam_warp.capture.mask_corrections import FILE_NAME, MaskCorrections, read_mask_corrections
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.mattes import MaskOffset
 from beam_warp.errors import AssetFormatError
 
@@ -33,11 +33,11 @@ def test_the_finding_names_the_cameras():
 
 
 def test_files_come_back_and_damage_is_named(tmp_path):
-    assert read_mask_corrections(tmp_path) is None
-    path = tmp_path / FILE_NAME
+    assert MaskCorrections.read(tmp_path) is None
+    path = tmp_path / MaskCorrections.FILE
     path.write_text(json.dumps({"key": "k", **FOUND.as_dict()}))
-    assert read_mask_corrections(tmp_path) == FOUND
+    assert MaskCorrections.read(tmp_path) == FOUND
     for content in ("[]", '{"cameras": 3}', '{"cameras": {"a": {"pixels": 1e9, "error": 0}}}', '{"cameras": {"a": 1}}'):
         path.write_text(content)
         with pytest.raises(AssetFormatError, match="corrections of masks must be as beam reconstruct wrote them"):
-            read_mask_corrections(tmp_path)
+            MaskCorrections.read(tmp_path)

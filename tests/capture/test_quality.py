@@ -10,7 +10,7 @@ from support.discs import SIDE, WALL, before, disc
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.inspect import inspect_capture
-from beam_warp.capture.quality import edge_blur, photon_noise
+from beam_warp.capture.quality import FEWEST, _deviations, edge_blur, photon_noise
 from beam_warp.image.files import quantization_error
 from beam_warp.stability.flaws.optics import defocused, motion_blurred
 from beam_warp.stability.flaws.write import write_flawed
@@ -49,6 +49,13 @@ def test_a_photograph_shows_its_blur_by_its_colors():
     photograph = gaussian_filter(before(WALL, disc()), (0.7, 0.7, 0.0), mode="nearest")
     least, largest = edge_blur(photograph, disc())
     assert 0.7 * 0.7 < least <= largest < 1.05 * 0.7
+
+
+def test_directions_without_edges_are_not_blurred():
+    """The covariance that fits edges within 45 degrees of one direction may be large across it, by chance."""
+    quartiles, angles = np.array([-0.17, -0.03, -0.06, -0.10]), (np.array([0.0, 1.0, 6.0, 7.0]) + 0.5) * np.pi / 8.0
+    normals = np.stack([np.sin(angles), np.cos(angles)], axis=1).repeat(FEWEST, axis=0)
+    assert _deviations(quartiles.repeat(FEWEST), normals) == (0.0, 0.0)
 
 
 def test_nothing_tells_without_an_outline():

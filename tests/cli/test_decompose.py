@@ -97,6 +97,7 @@ def test_with_the_light_of_the_capture_and_again(figure, small, tmp_path, capsys
     assert said.err == ""
     assert report == json.loads((out / "report.json").read_text())
     assert report["options"]["materials"]["sample_count"] == 4
+    assert 4.0 <= report["economy"]["light_rays_per_gaussian"] <= 16.0
     assert report["resumed_frames"] == 1
 
 

@@ -11,7 +11,7 @@ from PIL import Image as PillowImage
 from support.commands import beam
 from support.sound_capture import CAMERAS, FLIP, FRAMES, TARGET, rewrite, rig, save, write_sound
 
-from beam_warp.capture.corrections import FILE_NAME, CameraCorrection, RigCorrection
+from beam_warp.capture.corrections import CameraCorrection, RigCorrection
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def corrections(**changes):
 
 def test_what_a_reconstruction_found_wrong_with_cameras_is_said_and_drawn(sound, tmp_path, capsys):
     (tmp_path / "reconstruction").mkdir()
-    (tmp_path / "reconstruction" / FILE_NAME).write_text(json.dumps(corrections().as_dict()))
+    (tmp_path / "reconstruction" / RigCorrection.FILE).write_text(json.dumps(corrections().as_dict()))
     assert beam("inspect", sound, "--cameras", tmp_path, "--out", tmp_path) == 0
     said = capsys.readouterr().out
     assert "cameras contradict each other by 0.12 ± 0.02 pixels, at most 0.41, and were moved to agree (c02)" in said
@@ -78,7 +78,7 @@ def test_what_a_reconstruction_found_wrong_with_cameras_is_said_and_drawn(sound,
     with PillowImage.open(tmp_path / "capture.png") as picture:
         assert (np.asarray(picture.convert("RGB")) == (255, 212, 0)).all(axis=-1).any()  # the arrow
     sound_rig = json.dumps(corrections(is_applied=False).as_dict())
-    (tmp_path / FILE_NAME).write_text(sound_rig)
+    (tmp_path / RigCorrection.FILE).write_text(sound_rig)
     assert beam("inspect", sound, "--cameras", tmp_path, "--json") == 0
     assert json.loads(capsys.readouterr().out)["corrections"] == json.loads(sound_rig)
 
@@ -117,7 +117,7 @@ def test_what_cannot_be_read_or_written(tmp_path, refused):
     write_sound(tmp_path)
     refused("inspect", tmp_path, "--out", tmp_path / "file", says="out must be a folder")
     refused("inspect", tmp_path, "--cameras", tmp_path, says="cameras must be the folder of a reconstruction with")
-    (tmp_path / FILE_NAME).write_text("{}")
+    (tmp_path / RigCorrection.FILE).write_text("{}")
     refused("inspect", tmp_path, "--cameras", tmp_path, says="corrections of cameras must be as beam reconstruct")
 
 

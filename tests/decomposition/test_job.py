@@ -85,9 +85,9 @@ def test_everything_is_written_valid_and_readable(whole):
     assert np.allclose(cloud.roughness, 0.5)
     report = json.loads((whole.asset.parent / "report.json").read_text())
     assert report["materials"]["gaussians"] == 200
-    # Every point of a convex body is open: 8 rays each for occlusion and light, in three frames
+    # Every point of a convex body is open: 8 rays for occlusion and, as nothing is noisy, 4 for light, in three frames
     rays = report["light_and_occlusion_rays_per_second"] * report["seconds"]["materials"]
-    assert rays == pytest.approx(3 * 200 * 8 * 2)
+    assert rays == pytest.approx(3 * 200 * (8 + 4))
     assert report["device"]["kind"] == "cpu"
     assert read_image(whole.overview).width > 48
     assert report["exposure_is_fitted"]

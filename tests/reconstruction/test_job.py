@@ -18,9 +18,9 @@ from support.leftovers import temporary_of_the_dead
 
 from beam_warp import read, validate
 from beam_warp.capture.capture import Capture, CaptureRecord
-from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera, read_corrections
-from beam_warp.capture.exposures import CameraExposure, RigExposures, read_exposures
-from beam_warp.capture.mask_corrections import MaskCorrections, read_mask_corrections
+from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera
+from beam_warp.capture.exposures import CameraExposure, RigExposures
+from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.mattes import MaskOffset
 from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
@@ -415,7 +415,7 @@ class TestCameras:
         np.testing.assert_array_equal(used[0].camera.position, steps.cameras[0].position)
         assert found.report["cameras"] == self.RIG.as_dict()
         assert {finding["code"] for finding in found.report["findings"]} >= {"camera-poses", "camera-contradicts"}
-        assert read_corrections(tmp_path / "out") == self.RIG
+        assert RigCorrection.read(tmp_path / "out") == self.RIG
 
     def test_a_continued_job_does_not_seek_again(self, capture, steps, tmp_path):
         reconstruct(capture, tmp_path / "out", steps, BEGINNING)
@@ -431,7 +431,7 @@ class TestCameras:
         assert steps.refined == [("c0", "c1", "c2")]
         assert found.capture is capture
         assert found.report["cameras"] is None
-        assert read_corrections(tmp_path / "out") is None
+        assert RigCorrection.read(tmp_path / "out") is None
         with pytest.raises(InvalidOptionError, match="cameras must be one of refine, keep, got 'move'"):
             ReconstructOptions(cameras="move")
 
@@ -463,13 +463,13 @@ class TestExposures:
             np.testing.assert_array_equal(factor * after.view().color, before.view().color)
         assert found.report["exposures"] == self.FOUND.as_dict()
         assert "camera-exposure" in {finding["code"] for finding in found.report["findings"]}
-        assert read_exposures(tmp_path / "out") == self.FOUND
+        assert RigExposures.read(tmp_path / "out") == self.FOUND
         again = FakeSteps()  # would find nothing
         assert reconstruct(capture, tmp_path / "out", again, BEGINNING).report["exposures"] == self.FOUND.as_dict()
         assert again.calls == []
         kept = reconstruct(capture, tmp_path / "out", steps, replace(BEGINNING, exposures="keep"))
         assert kept.capture is capture
-        assert read_exposures(tmp_path / "out") is None
+        assert RigExposures.read(tmp_path / "out") is None
 
 
 def down_of(camera):
@@ -490,7 +490,7 @@ class TestMasks:
         assert "mask-offset" in {finding["code"] for finding in found.report["findings"]}
         excess = {record.camera_name: record.mask_excess for record in found.capture.records}
         assert excess == {"c0": 0.0, "c1": -0.7, "c2": 0.0}
-        assert read_mask_corrections(tmp_path / "out") == self.FOUND
+        assert MaskCorrections.read(tmp_path / "out") == self.FOUND
         assert reconstruct(capture, tmp_path / "out", again, BEGINNING).report["masks"] == found.report["masks"]
         assert (again.mended, again.calls) == ([], [])
 
@@ -501,4 +501,4 @@ class TestMasks:
         found = reconstruct(capture, tmp_path / "out", steps, replace(BEGINNING, masks="keep"))
         assert len(steps.mended) == 1
         assert found.capture is capture
-        assert read_mask_corrections(tmp_path / "out") is None
+        assert MaskCorrections.read(tmp_path / "out") is None

@@ -146,8 +146,8 @@ def test_moved_cameras_of_a_ball_come_nearer_with_the_same_bits(device, monkeypa
 def test_a_sound_rig_stays_to_the_bit_after_one_look(device, monkeypatch):
     monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 4, 1, 1),))
     monkeypatch.setattr(rig.RigFitter, "_move", None)
-    views = ball_views(cameras_around(6, 40))
-    found = refine_rig([f"c{k}" for k in range(6)], views, FitOptions.of_preset("draft"), device=device)
+    views = ball_views(cameras_around(8, 40))
+    found = refine_rig([f"c{k}" for k in range(8)], views, FitOptions.of_preset("draft"), device=device)
     assert found is not None
     assert not found.is_applied
     assert 0.0 < found.pixels < 2.0 * found.error
@@ -180,7 +180,7 @@ def test_cameras_of_a_capture_are_found_again(device, walker_views, size, rng):
 
 
 def test_too_few_cameras_or_no_masks_say_nothing():
-    views = ball_views(cameras_around(6))
-    names = [f"c{k}" for k in range(6)]
-    assert refine_rig(names[:5], views[:5], FitOptions(), device="cpu") is None
+    views = ball_views(cameras_around(8))
+    names = [f"c{k}" for k in range(8)]
+    assert refine_rig(names[:7], views[:7], FitOptions(), device="cpu") is None
     assert refine_rig(names, [replace(views[0], alpha=None), *views[1:]], FitOptions(), device="cpu") is None

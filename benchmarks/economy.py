@@ -1,0 +1,204 @@
+"""What do rays bring where they are needed, instead of as many for every Gaussian: error, bias, time and scores?
+
+    python benchmarks/economy.py [--device cuda:0] --out JSON
+
+Materials of Gaussians on the true surface of three captures and of the demo's are measured with every Gaussian's light
+by as many rays, and by as many as its neighbours' first rays say that it needs. Errors are of the arriving light at
+each Gaussian, relative to it or to a twentieth of its mean, against many rays by another density. *Equal* is how many
+rays for each have the same error, between those that were measured. *Stopped* is what not to do: each Gaussian stops
+once its own rays agree; and *occlusion* is what the same rule would bring there. Both are looked up in the runs with as
+many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import record
+from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_reference, rms
+from numpy.typing import NDArray
+from timing import Task, spread, take_turns
+
+from beam_warp.capture.capture import Capture
+from beam_warp.demo.capture import write_demo_capture
+from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
+from beam_warp.materials.direct import MaterialMeasurement, MaterialOptions, measure_materials
+from beam_warp.materials.pilot import rays_needed
+from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.trace.occlusion import ambient_occlusion
+from beam_warp.trace.rays import ray_batches
+from beam_warp.world.environment import EnvironmentMap
+
+CAPTURES = ("walker", "runner", "robot", "demo")
+FIXED = (16, 32, 64, 128, 256)
+TARGETS = (0.025, 0.05, 0.1, 0.2)
+OCCLUSION_TARGETS = (0.01, 0.02, 0.04)
+REPEATS = 5
+
+Errors = Mapping[int, NDArray[np.floating[Any]]]
+"""Errors of Gaussians by rays for each."""
+
+
+class Subject:
+    """A frame on its true surface, and what its light is."""
+
+    def __init__(self, capture: Capture, count: int, rays: int, device: Any) -> None:
+        """Sample the surface and trace the reference."""
+        assert capture.environment_path is not None
+        frame = truth_frames(capture)[0]
+        self.frame = PerfectFrame.of(capture, frame, count, device)
+        self.points = self.frame.points(exact=False)
+        self.light = PreparedEnvironment(EnvironmentMap.read(capture.environment_path), device)
+        self.roughness = np.full(count, 0.5, np.float32)
+        self.truth = TruthViews(capture, frame, SHARP, 2, str(device))
+        lit = self.measured(MaterialOptions(light_error=0.0)).evidence.unseen == 0.0
+        self.rows = np.flatnonzero(lit)
+        found = light_reference(self.frame.scene, self.points, self.rows, self.light, rays)
+        self.reference = found.value
+        self.scale = np.maximum(found.value, 0.05 * found.value.mean())
+
+    def measured(self, options: MaterialOptions) -> MaterialMeasurement:
+        """Measure all materials of the frame."""
+        frame = self.frame
+        return measure_materials(
+            frame.cloud, frame.scene, self.points, self.roughness, self.light, options=options, views=frame.evidence
+        )
+
+    def errors(self, found: MaterialMeasurement) -> NDArray[np.float64]:
+        """Return relative errors of the arriving light, ``(M, 3)``."""
+        return (found.evidence.irradiance[self.rows] / np.pi - self.reference) / self.scale
+
+    def scores(self, found: MaterialMeasurement) -> dict[str, float]:
+        """Return PSNR of occlusion and base colour in the test views."""
+        cloud, points = self.frame.cloud, self.points
+        known = cloud.with_arrays(normal_confidence=points.confidence)
+        color = solve_base_color(known, found.evidence, self.light.mean_irradiance).base_color
+        openness, _ = fill_from_neighbors(
+            cloud.positions, found.ambient_occlusion[:, None], found.ambient_occlusion_error[:, None], ~points.seen
+        )
+        row = self.truth.score(cloud, Materials(color, openness[:, 0].astype(np.float32)))
+        return {name: row[name]["psnr"] for name in ("ambient_occlusion", "base_color")}
+
+    def curve(self) -> NDArray[np.int32]:
+        """Return the lit rows' order along the curve by which neighbours are found."""
+        at = upload(self.rows.astype(np.int32), int, self.frame.scene.device)
+        positions, normals = self.points.positions[at].contiguous(), self.points.normals[at].contiguous()
+        return np.concatenate([b.rows.numpy() for b in ray_batches(self.frame.scene, positions, normals, 0.0, 1)])
+
+
+def summary(errors: NDArray[np.floating[Any]]) -> dict[str, float]:
+    """Return what errors of independent points come to."""
+    each = errors.reshape(len(errors), -1).mean(axis=1, dtype=np.float64)
+    return {
+        "rmse": rms(errors),
+        "largest_hundredth": float(np.percentile(np.abs(errors), 99)),
+        "mean": float(each.mean()),
+        "mean_in_standard_errors": float(each.mean() / (each.std(ddof=1) / np.sqrt(len(each)))),
+    }
+
+
+def equal_rays(error: float, errors: Errors) -> float:
+    """Return how many rays for each have an error, between those that were measured, on logarithmic axes."""
+    counts, fixed = np.log(list(errors)), np.log([rms(found) for found in errors.values()])
+    return float(np.exp(np.interp(np.log(error), fixed[::-1], counts[::-1])))
+
+
+def light_of(subject: Subject, device: Any, repeats: int) -> dict[str, Any]:
+    """Return errors of the light by rays for each and by target; scores and seconds at the default's occlusion."""
+    default = MaterialOptions().sample_count
+    fixed = {count: subject.measured(MaterialOptions(sample_count=count, light_error=0.0)) for count in FIXED}
+    errors = {count: subject.errors(found) for count, found in fixed.items()}
+    stated = {count: np.sqrt(found.evidence.noise[subject.rows]) for count, found in fixed.items()}
+    rows = [{"name": f"{count} rays each", "rays": count} | summary(errors[count]) for count in FIXED]
+    ways = {target: MaterialOptions(light_error=target) for target in (0.0, *TARGETS)}
+    times = take_turns({k: Task(lambda o=o: subject.measured(o)) for k, o in ways.items()}, repeats, device)
+    rows[FIXED.index(default)] |= {"seconds": spread(times[0.0].alone), "scores": subject.scores(fixed[default])}
+    for target in TARGETS:
+        found = subject.measured(ways[target])
+        row = {"name": f"target {target:g}", "rays": found.economy["rays"] / found.economy["points"]}
+        row |= summary(subject.errors(found))
+        row["equal_rays"] = equal_rays(row["rmse"], errors)
+        row |= {"seconds": spread(times[target].alone), "scores": subject.scores(found)}
+        row["faster"] = times[target].faster_than(times[0.0])
+        rows.append(row)
+    return {"rows": rows, "stopped": [stopped(errors, stated, target) for target in TARGETS]}
+
+
+def chosen(errors: Errors, counts: NDArray[np.integer[Any]]) -> NDArray[np.floating[Any]]:
+    """Return the errors of each Gaussian at its own number of rays."""
+    result = errors[FIXED[0]].copy()
+    for count in FIXED:
+        result[counts == count] = errors[count][counts == count]
+    return result
+
+
+def stopped(errors: Errors, stated: Errors, target: float) -> dict[str, Any]:
+    """Return what comes of stopping where a Gaussian's own rays agree."""
+    counts = np.full(len(stated[FIXED[0]]), FIXED[-1])
+    for count in reversed(FIXED[:-1]):
+        counts[stated[count] <= target] = count
+    return {"name": f"target {target:g}", "rays": float(counts.mean())} | summary(chosen(errors, counts))
+
+
+def occlusion_of(subject: Subject, rays: int) -> list[dict[str, Any]]:
+    """Return what the rule would bring for occlusion."""
+    frame, rows, points = subject.frame, subject.rows, subject.points
+    normals = points.normals.numpy()[rows]
+    lifted = (points.positions.numpy()[rows] + normals * points.offsets.numpy()[rows, None]).astype(np.float32)
+
+    def traced(count: int, seed: int = 0) -> Any:
+        return ambient_occlusion(frame.scene, lifted, normals, sample_count=count, offset=0.0, seed=seed)
+
+    truth = traced(rays, 1 << 31).visibility.astype(np.float64)
+    found = {count: traced(count) for count in FIXED}
+    errors = {count: found[count].visibility - truth for count in FIXED}
+    result = [{"name": f"{count} rays each", "rays": count} | summary(errors[count]) for count in FIXED]
+    order, counts = subject.curve(), np.empty(len(rows), np.int64)
+    for target in OCCLUSION_TARGETS:
+        counts[order] = rays_needed(found[FIXED[0]].standard_error[order], FIXED[0], FIXED[-1], count=64, target=target)
+        row = {"name": f"target {target:g}", "rays": float(counts.mean())} | summary(chosen(errors, counts))
+        result.append(row | {"equal_rays": equal_rays(row["rmse"], errors)})
+    return result
+
+
+def main() -> None:
+    """Measure every subject and write what came out."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--captures", nargs="+", default=CAPTURES, choices=CAPTURES)
+    parser.add_argument("--gaussians", type=int, default=20_000)
+    parser.add_argument("--reference-rays", type=int, default=1024)
+    parser.add_argument("--repeats", type=int, default=REPEATS)
+    record.add_arguments(parser)
+    given = parser.parse_args()
+    device = resolve_device(given.device)
+    rows: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in given.captures:
+            if name == "demo":
+                capture = write_demo_capture(Path(folder) / "demo", frame_count=1, samples=64, device=str(device))
+            else:
+                capture = Capture.read(Path(given.data) / "captures" / name)
+            subject = Subject(capture, given.gaussians, given.reference_rays, device)
+            found = light_of(subject, device, given.repeats)
+            rows[name] = {
+                "points": len(subject.rows),
+                "light": found,
+                "occlusion": occlusion_of(subject, given.reference_rays),
+            }
+            record.write_result(given, device, {"captures": rows})
+            for row in found["rows"]:
+                print(name, {key: value for key, value in row.items() if key != "seconds"}, flush=True)
+
+
+if __name__ == "__main__":
+    main()

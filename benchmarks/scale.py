@@ -1,0 +1,266 @@
+"""How long takes scale: the plan of a take, carried out by simulated workers, and what the driver adds at the end.
+
+    python benchmarks/scale.py [--quick] [--parts PART] --out result.json
+
+- ``constants``: seconds of a step by stage, from results that were measured on a GPU (`RECONSTRUCTED`, `DECOMPOSED`);
+  and of writing the asset, a frame, measured here, by the processor's time of a cloud in which everything varies.
+- ``takes``: the plan that ``beam run`` makes of 18,000 frames, handed out by the schedule that carries it out.
+- ``check``: a take of steps that sleep, carried out by processes of this machine, beside its simulation.
+
+Steps that are made once, and previews, take no time in ``takes``: nobody has measured them for such a take.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import parts
+import record
+
+from beam_warp import converters
+from beam_warp.decomposition.frames import ReconstructedFrames
+from beam_warp.decomposition.options import RunOptions
+from beam_warp.decomposition.work import MaterialWork
+from beam_warp.device.arrays import resolve_device
+from beam_warp.outputs import replacing
+from beam_warp.plan.carry import carry_out
+from beam_warp.plan.crew import crew_of
+from beam_warp.plan.standing import simulated
+from beam_warp.plan.steps import Plan, Step, Task
+from beam_warp.reconstruction.frames.plan import FramePlan, plan_segments
+from beam_warp.reconstruction.job import ReconstructionWork, ReconstructOptions
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+
+Row = dict[str, Any]
+
+RECONSTRUCTED, DECOMPOSED = "reconstruction_h200.json", "materials_cost_h200.json"
+FRAMES, WORKERS, SEGMENTS = 18_000, (1, 2, 8, 64, 256, 1024), (30, 120)
+
+
+@dataclass
+class Bench:
+    """Sizes of what is measured.
+
+    Attributes:
+        frames: Of the take that is simulated.
+        count: Gaussians of the asset that is written.
+        written: Frames of it.
+        nap: How long a second of a step takes in ``check`` [s].
+    """
+
+    frames: int = FRAMES
+    count: int = 140_000
+    written: int = 90
+    nap: float = 0.5
+
+    def say(self, words: str) -> None:
+        """Print a line."""
+        print(words, flush=True)
+
+    @functools.cached_property
+    def written_frame(self) -> Row:
+        """Seconds of the processor, and bytes, of a frame of an asset."""
+        clouds = [_random_cloud(self.count, seed) for seed in range(3)]
+        sequence = GaussianSequence(
+            frame_count=self.written,
+            read_frame=lambda index: clouds[index % len(clouds)],
+            frames_per_second=30.0,
+            constant=frozenset(),
+            topology="perFrame",
+            metadata={},
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            began = time.process_time()
+            layers = converters.write(sequence, Path(folder) / "asset.usda")
+            seconds = time.process_time() - began
+            size = sum(layer.stat().st_size for layer in layers)
+        return {"seconds": seconds / self.written, "bytes": size / self.written}
+
+
+def _random_cloud(count: int, seed: int) -> GaussianCloud:
+    """Return a cloud with all that a decomposed frame has; nothing in it can be compressed."""
+    random = np.random.default_rng(seed)
+
+    def even(*shape: int) -> np.ndarray:
+        return random.random((count, *shape), dtype=np.float32)
+
+    def unit(size: int) -> np.ndarray:
+        vectors = even(size) - 0.5
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+    return GaussianCloud(
+        positions=even(3),
+        orientations=unit(4),
+        scales=0.001 + 0.01 * even(3),
+        opacities=even(),
+        radiance=even(4, 3),
+        radiance_color_space="srgb_rec709_display",
+        base_color=even(3),
+        base_color_error=even(3),
+        roughness=even(),
+        roughness_error=even(),
+        ambient_occlusion=even(),
+        observability=even(),
+        normals=unit(3),
+        axes="rfu",
+    )
+
+
+def constants(bench: Bench) -> Iterator[Row]:
+    """Seconds a step, by stage; of a key frame and a tracked one."""
+    known = {
+        name: json.loads((record.RESULTS / name).read_text(encoding="utf-8")) for name in (RECONSTRUCTED, DECOMPOSED)
+    }
+    key, tracked = (known[RECONSTRUCTED]["large"]["frames"][k]["seconds"] for k in (0, 1))
+    materials = known[DECOMPOSED]["cost"]["direct, with roughness"]["seconds"]["median"]
+    yield {
+        "key_frame": key,
+        "tracked_frame": tracked,
+        "materials": materials,
+        "written": bench.written_frame,
+        "devices": sorted({content["measured"]["machine"]["device"] for content in known.values()}),
+    }
+
+
+def take_steps(frames: int, segment: int) -> tuple[Step, ...]:
+    """Return the steps of ``beam run`` for a take; nothing of it is read."""
+    kept = ReconstructOptions(cameras="keep", masks="keep", exposures="keep", segment_length=segment)
+    with tempfile.TemporaryDirectory() as name:
+        folder: Any = Path(name)
+        nothing: Any = None
+        planned = FramePlan(dict.fromkeys(range(frames), ()), plan_segments(range(frames), segment), ())
+        frames_work = ReconstructionWork(nothing, folder, nothing, kept, planned, [])
+        light = EnvironmentMap(np.ones((4, 8, 3), np.float32))
+        work = MaterialWork(folder, ReconstructedFrames(frames_work, None), light, RunOptions())
+        return work.plan().with_steps_of(frames_work.plan()).steps
+
+
+def as_stages(steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """Return the steps with a stage of its own for key frames, which take longer."""
+    keys = [step.stage == "frame" and not step.inputs for step in steps]
+    return tuple(
+        Step(step.name, "key_frame" if is_key else step.stage, step.frame, step.inputs, step.rank)
+        for step, is_key in zip(steps, keys, strict=True)
+    )
+
+
+def takes(bench: Bench) -> Iterator[Row]:
+    """Hours, GPU hours and efficiency of a take, by workers; with and without the driver's own work at the end."""
+    (known,) = constants(bench)
+    seconds = {
+        "key_frame": known["key_frame"],
+        "frame": known["tracked_frame"],
+        "materials": known["materials"],
+        "light": 0.0,
+        "preview": 0.0,
+    }
+    rows: list[Row] = []
+    for segment in SEGMENTS:
+        steps = as_stages(take_steps(bench.frames, segment))
+        work = sum(seconds[step.stage] for step in steps)
+        end = bench.frames * known["written"]["seconds"]
+        for workers in WORKERS:
+            spent = simulated(steps, (), seconds, workers)
+            rows.append(
+                {
+                    "name": f"{workers} x {segment}",
+                    "workers": workers,
+                    "segment": segment,
+                    "hours": spent / 3600.0,
+                    "end_hours": end / 3600.0,
+                    "busy_hours": work / 3600.0,
+                    "efficiency": work / (workers * spent),
+                    "efficiency_with_end": work / (workers * (spent + end)),
+                    "frames_per_hour_a_worker": bench.frames / (spent / 3600.0) / workers,
+                }
+            )
+            bench.say(json.dumps(rows[-1]))
+            yield {"frames": bench.frames, "rows": rows}
+
+
+@dataclass
+class Naps:
+    """Work whose steps sleep."""
+
+    folder: Path
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def common(self) -> str:
+        """Return nothing: no code matters."""
+        return ""
+
+    def digest(self, step: Step) -> str:
+        """Return nothing: nothing is read."""
+        return ""
+
+    def outputs(self, step: Step) -> tuple[Path, ...]:
+        """Return one small file."""
+        return (self.folder / "out" / step.name,)
+
+    def do(self, task: Task, progress: Any) -> Mapping[str, Any]:
+        """Sleep as long as the stage takes."""
+        time.sleep(self.seconds[task.step.stage])
+        with replacing(self.outputs(task.step)[0]) as temporary:
+            temporary.write_bytes(b"")
+        return {}
+
+
+def check(bench: Bench) -> Iterator[Row]:
+    """Compare the simulation with processes that sleep through the plan of 16 segments."""
+    seconds = {"key_frame": 12.0, "frame": 11.0, "materials": 3.0, "light": 1.0, "preview": 1.0}
+    naps = {stage: bench.nap * spent for stage, spent in seconds.items()}
+    steps = as_stages(take_steps(16 * 5, 5))
+    rows: list[Row] = []
+    for workers in (4, 8):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            (folder / "out").mkdir()
+            plan = Plan(folder, steps, dict.fromkeys(naps, Naps(folder, naps)))
+            receipts = carry_out(plan, crew_of(str(workers), None)(plan, "", lambda *_: None))
+            end = max(receipt.ended for receipt in receipts.values())
+            starts: dict[str, float] = {}
+            for receipt in receipts.values():  # a process takes seconds to start, which a long take does not see
+                began = receipt.ended - receipt.seconds
+                starts[receipt.worker] = min(starts.get(receipt.worker, began), began)
+        work = sum(naps[step.stage] for step in steps)
+        spent = sum(end - start for start in starts.values())
+        rows.append(
+            {
+                "name": str(workers),
+                "workers": workers,
+                "steps": len(steps),
+                "efficiency": work / spent,
+                "simulated_efficiency": work / (workers * simulated(steps, (), naps, workers)),
+            }
+        )
+        bench.say(json.dumps(rows[-1]))
+        yield {"rows": rows}
+
+
+PARTS = {"constants": constants, "takes": takes, "check": check}
+
+
+def main() -> None:
+    """Measure, and write the result after every part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="smaller, to see whether it runs")
+    parser.add_argument("--parts", nargs="+", choices=tuple(PARTS), default=())
+    record.add_arguments(parser)
+    arguments = parser.parse_args()
+    bench = Bench(frames=600, count=2000, written=6, nap=0.01) if arguments.quick else Bench()
+    keep = functools.partial(record.write_result, arguments, resolve_device("cpu"))
+    parts.measure(PARTS, bench, only=arguments.parts, keep=keep)
+
+
+if __name__ == "__main__":
+    main()
