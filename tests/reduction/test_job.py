@@ -20,6 +20,7 @@ from beam_warp.image.files import write_exr
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
+from beam_warp.reduction import job
 from beam_warp.reduction.job import ReduceOptions, Reducer, reduce_asset
 from beam_warp.reduction.sensitivity import LIGHTS as EACH
 from beam_warp.reduction.sensitivity import MATERIALS, material_rows, pixel_sums
@@ -28,7 +29,7 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 RASTER = RasterOptions(antialiased=True)
 LIGHTS = [demo_environments()["studio"].resized(16, 32), demo_environments()["stage"].resized(16, 32)]
-QUICK = ReduceOptions(gaussians=60, height=32, views=6, steps=8, pairs=10, device="cpu")
+QUICK = ReduceOptions(gaussians=60, height=32, views=4, steps=6, pairs=6, device="cpu")
 
 
 def ball(count: int = 300, frames: int = 1) -> GaussianSequence:
@@ -56,6 +57,12 @@ def ball(count: int = 300, frames: int = 1) -> GaussianSequence:
             )
         )
     return GaussianSequence.from_clouds(clouds, metadata=RASTER.as_metadata())
+
+
+@pytest.fixture
+def few_draws(monkeypatch):
+    """A search that judges candidates by few draws."""
+    monkeypatch.setattr(job, "TRIED", 4)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +112,7 @@ def test_the_same_call_gives_the_same_bits(reducer):
 
 
 @pytest.mark.parametrize("name", ["small.usda", pytest.param("small.b4d", marks=pytest.mark.slow)])
-def test_a_moving_asset_is_certified_as_it_is_stored(name, tmp_path):
+def test_a_moving_asset_is_certified_as_it_is_stored(name, tmp_path, few_draws):
     original = ball(200, frames=3)
     found = reduce_asset(original, LIGHTS, replace(QUICK, gaussians=40), tmp_path / name)
     back = converters.read(tmp_path / name)
@@ -126,7 +133,7 @@ def test_a_moving_asset_is_certified_as_it_is_stored(name, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_size_is_kept(tmp_path):
+def test_a_size_is_kept(tmp_path, few_draws):
     original = ball()
     converters.write(original, tmp_path / "all.b4d")
     size = (tmp_path / "all.b4d").stat().st_size // 2
@@ -191,7 +198,7 @@ def test_assets_that_cannot_be_reduced_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_writes_what_the_validator_accepts(tmp_path, capsys):
+def test_the_command_writes_what_the_validator_accepts(tmp_path, capsys, few_draws):
     converters.write(ball(), tmp_path / "all.usda")
     bright = LIGHTS[0].radiance
     write_exr(tmp_path / "light.exr", {name: bright[..., index] for index, name in enumerate("RGB")})
