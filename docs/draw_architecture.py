@@ -46,7 +46,7 @@ COLORS = {
     "#d3e8d3": ("image", "world", "schema", "converters", "capture", "mesh", "stage"),
     "#fdebc8": ("light", "trace", "raster", "render", "interop"),
     "#d2e3f7": ("materials", "reconstruction", "decomposition"),
-    "#ecdcf2": ("evaluate", "demo", "study", "stability", "view", "cli"),
+    "#ecdcf2": ("evaluate", "demo", "study", "reduction", "stability", "view", "cli"),
 }
 """What packages are about: foundations, data, light transport, solving for an asset, and using one."""
 

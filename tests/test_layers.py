@@ -22,7 +22,7 @@ mesh render interop
 materials reconstruction stage view
 decomposition
 evaluate demo study
-stability
+reduction stability
 cli
 """
 """Packages and single modules of `beam_warp` from the bottom up; those of one floor do not import each other."""

@@ -49,6 +49,7 @@ COMMANDS = {
     "channel": Command("DrawChannel", "Draw one array of an asset without light: materials, errors, flags."),
     "view": Command("ViewCommand", "Look at an asset in the browser, under lights that are moved about."),
     "evaluate": Command("Evaluate", "Score an asset against a capture whose truth is known."),
+    "reduce": Command("Reduce", "Merge Gaussians until a bound on relit images, a size or a number is met."),
     "mesh": Command("Mesh", "Extract the surface of every frame as a mesh."),
     "demo": Command("Demo", "Build, capture, decompose, relight and score a small figure."),
     "stability": Command("Stability", "Run what tracing, reconstruction, materials and relighting may fail on."),

@@ -39,6 +39,12 @@ class Validate:
     ] = None
     fix: Annotated[bool, arg(help="Mend in place what is safe to mend, then check.")] = False
     physical: Annotated[bool, arg(help="Also trace the asset and judge it by physics, which is slower.")] = False
+    original: Annotated[
+        Path | None, arg(metavar="ASSET", help="What it was reduced from: --physical repeats its certificate.")
+    ] = None
+    environment: Annotated[
+        tuple[Path, ...], arg(metavar="FILE ...", help="The lights that `beam reduce` was given, if any.")
+    ] = ()
     device: Annotated[
         str | None, arg(help="cpu, cuda:0, … for --physical; the first GPU by default, if there is one.")
     ] = None
@@ -96,12 +102,21 @@ def _with_physics(asset: str, report: Report, command: Validate) -> tuple[Report
             f"physical must be given a valid asset, got one that breaks {report.findings[0].rule}. "
             "Mend what beam-validate reports without it first."
         )
+    from beam_warp import converters
+    from beam_warp.demo.lights import demo_environments
     from beam_warp.evaluate.physical import measure_physics
     from beam_warp.evaluate.physical_rules import broken
     from beam_warp.schema.reader import read_asset
+    from beam_warp.world.environment import EnvironmentMap
 
     with progress(command.quiet or command.json) as listener:
-        measured = measure_physics(read_asset(asset, trusted=True), device=command.device, progress=listener)
+        measured = measure_physics(
+            read_asset(asset, trusted=True),
+            device=command.device,
+            original=None if command.original is None else converters.read(command.original),
+            environments=[EnvironmentMap.read(path) for path in command.environment] or [*demo_environments().values()],
+            progress=listener,
+        )
     findings = sorted((*report.findings, *broken(measured)), key=lambda found: found.severity)
     return replace(report, findings=tuple(findings)), measured
 

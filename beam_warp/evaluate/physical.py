@@ -16,6 +16,7 @@ from beam_warp.checks import require_count
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidOptionError
 from beam_warp.evaluate import physical_rules as rules
+from beam_warp.evaluate.certificate import measured_again
 from beam_warp.evaluate.physical_rules import LEAST_OPACITY, Measured
 from beam_warp.evaluate.steadiness import RunningVariance
 from beam_warp.jobs.listeners import StageProgress, no_progress
@@ -25,6 +26,7 @@ from beam_warp.schema.authoring import KERNEL_EXTENT
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.scene import Scene
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, Observability
 from beam_warp.world.quaternions import rotation_matrices
 
@@ -48,7 +50,13 @@ NOT_CERTAIN = NOT_MEASURED | Observability.UNCERTAIN_NORMAL
 
 
 def measure_physics(
-    sequence: GaussianSequence, *, device: str | None = None, seed: int = 0, progress: StageProgress = no_progress
+    sequence: GaussianSequence,
+    *,
+    device: str | None = None,
+    seed: int = 0,
+    original: GaussianSequence | None = None,
+    environments: Sequence[EnvironmentMap] = (),
+    progress: StageProgress = no_progress,
 ) -> list[Measured]:
     """Measure an asset against all rules of physics.
 
@@ -56,6 +64,8 @@ def measure_physics(
         sequence: Relightable, in metres, any axes.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
         seed: Same seed, same device, same numbers.
+        original: What a reduced asset was made from, so that its certificate can be measured again.
+        environments: The lights of that certificate.
         progress: Called with (stage, done, total).
 
     Returns:
@@ -63,7 +73,7 @@ def measure_physics(
         frame that is nearest to the bound, or furthest beyond.
 
     Raises:
-        InvalidOptionError: The asset is not relightable, or the seed is out of range.
+        InvalidOptionError: The asset is not relightable, the seed is out of range, or the original is another one.
         DeviceError: There is no such device.
     """
     require_count("seed", seed, 0, 2**32 - 1)
@@ -81,6 +91,8 @@ def measure_physics(
             if before is None or _margin(measured) < _margin(before):
                 worst[measured.rule] = measured
     worst[rules.STEADY.id] = steadiness(sequence)
+    progress("measure the certificate again", 0, 1)
+    worst[rules.CERTIFIED.id] = measured_again(sequence, original, environments, device=device)
     return [worst[rule.id] for rule in rules.PHYSICAL_RULES]
 
 

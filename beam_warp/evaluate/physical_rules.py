@@ -58,7 +58,7 @@ class PhysicalRule:
     attribute: str
 
 
-FURNACE, OCCLUSION, FACING, SHAPE, COLOR, STEADY = PHYSICAL_RULES = (
+FURNACE, OCCLUSION, FACING, SHAPE, COLOR, STEADY, CERTIFIED = PHYSICAL_RULES = (
     PhysicalRule(
         "BEAM-PHYS-001",
         "error",
@@ -100,6 +100,13 @@ FURNACE, OCCLUSION, FACING, SHAPE, COLOR, STEADY = PHYSICAL_RULES = (
         "Materials of a Gaussian vary over time by no more than four times their standard error, for all but 1/16.",
         "Smooth the materials over time, or state their errors.",
         "beam:baseColorError",
+    ),
+    PhysicalRule(
+        "BEAM-PHYS-007",
+        "error",
+        "A certificate of relit images holds when it is measured again on its seed.",
+        "Reduce the original again.",
+        "beam:baseColor",
     ),
 )
 

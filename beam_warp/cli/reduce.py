@@ -1,0 +1,119 @@
+"""``beam reduce``: the fewest Gaussians whose relit images stay within a bound, with a certificate."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from beam_warp.cli.common.console import print_json, print_notes, progress
+from beam_warp.cli.common.flags import Device, Json, Quiet, ReadingFlags, Seed, notes_of
+from beam_warp.cli.common.pages import SECOND_PAGE
+from beam_warp.errors import InvalidOptionError
+
+if TYPE_CHECKING:
+    from beam_warp.reduction.job import Reduction
+
+UNITS = {"": 1, "B": 1, "KB": 1000, "MB": 1000**2, "GB": 1000**3}
+"""Bytes of the units of sizes."""
+
+
+@dataclass(frozen=True)
+class Reduce:
+    """Merge Gaussians until a target is met: a bound on the error of relit images, a size, or a number.
+
+    Errors are measured over random lights, cameras and frames: environments turned, suns, lamps. The certificate is
+    made on draws that the search did not see, and is written into the asset; beam-validate --physical repeats it.
+    See docs/reducing.md.
+
+    Example: beam reduce person/asset.usda --out small.usda --max-loss 0.5
+    """
+
+    asset: Annotated[
+        Positional[Path], arg(metavar="ASSET", help="A relightable asset: its folder, or a file of Gaussians.")
+    ]
+    out: Annotated[Path, arg(metavar="FILE", help="Asset to write: .usda, .usdc, or .b4d for players.")]
+    max_loss: Annotated[
+        float | None, arg(metavar="DB", help="Most loss of a good asset's PSNR against the truth, in 19 of 20 draws.")
+    ] = None
+    max_flip: Annotated[float | None, arg(metavar="X", help="Most FLIP against the original, in 19 of 20 draws.")] = (
+        None
+    )
+    size: Annotated[str | None, arg(metavar="BYTES", help="Most bytes of the file, such as 20MB.")] = None
+    gaussians: Annotated[int | None, arg(metavar="N", help="Number of Gaussians.")] = None
+    environment: Annotated[
+        tuple[Path, ...], arg(metavar="FILE ...", help="One to four lights to measure under; else the demo's three.")
+    ] = ()
+    height: Annotated[int, arg(metavar="PX", help="Side of compared images: how large it will be seen.")] = 256
+    pairs: Annotated[int, arg(metavar="N", help="Draws of light, camera and frame for the certificate.")] = 200
+    confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate.")] = 0.95
+    views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 48
+    steps: Annotated[Annotated[int, arg(metavar="N", help="Steps of a refit.")], SECOND_PAGE] = 200
+    reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
+    seed: Seed = 0
+    device: Device = None
+    quiet: Quiet = False
+    json: Json = False
+
+
+def reduce(args: Reduce) -> int:
+    """Reduce the asset and say what was found."""
+    started = time.perf_counter()
+    from beam_warp.demo.lights import demo_environments
+    from beam_warp.reduction.job import ReduceOptions, reduce_asset
+    from beam_warp.world.environment import EnvironmentMap
+
+    sequence = args.reading.read(args.asset)
+    options = ReduceOptions(
+        max_loss=args.max_loss,
+        max_flip=args.max_flip,
+        size=None if args.size is None else bytes_of(args.size),
+        gaussians=args.gaussians,
+        height=args.height,
+        pairs=args.pairs,
+        confidence=args.confidence,
+        views=args.views,
+        steps=args.steps,
+        seed=args.seed,
+        raster=args.reading.raster(sequence),
+        device=args.device,
+    )
+    environments = [EnvironmentMap.read(path) for path in args.environment] or [*demo_environments().values()]
+    with progress(args.quiet or args.json) as report:
+        found = reduce_asset(sequence, environments, options, args.out, progress=report)
+    seconds = time.perf_counter() - started
+    if args.json:
+        print_json({**_facts(found), "seconds": round(seconds, 3), "notes": notes_of(sequence)})
+    elif not args.quiet:
+        print_notes(notes_of(sequence))
+        print(f"{found.count:,} of {found.original_count:,} Gaussians in {args.out}, {seconds:.1f} s")
+        print(f"certified: {found.certificate}")
+    return 0
+
+
+def bytes_of(text: str) -> int:
+    """Return the bytes of a size such as ``20MB``.
+
+    Raises:
+        InvalidOptionError: It is none.
+    """
+    match = re.fullmatch(r"\s*(\d{1,15}(?:\.\d{1,9})?)\s*([KMG]?B?)\s*", text.upper())
+    if match is None or match[2] not in UNITS:
+        raise InvalidOptionError(f"size must be a number of bytes, got {text[:40]!r}. Write it like 20MB.")
+    return int(float(match[1]) * UNITS[match[2]])
+
+
+def _facts(found: Reduction) -> dict[str, object]:
+    """Return what a program wants to know."""
+    return {
+        "gaussians": found.count,
+        "original": found.original_count,
+        "bytes": sum(path.stat().st_size for path in found.paths),
+        "error_scale": found.error_scale,
+        "candidates": [{"gaussians": count, "error": error} for count, error in found.candidates],
+        "certificate": asdict(found.certificate),
+    }

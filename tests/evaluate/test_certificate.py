@@ -1,0 +1,110 @@
+"""Certificates: their arithmetic, and what stands in a file that strangers made."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from beam_warp.errors import AssetFormatError, InvalidOptionError
+from beam_warp.evaluate.certificate import KEY, Certificate, least_share
+from beam_warp.evaluate.relit import loss_of
+from beam_warp.evaluate.trials import RelitTrials
+from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+
+GREY = EnvironmentMap.constant((1.0, 1.0, 1.0))
+
+SOUND = Certificate(
+    measure="loss",
+    bound=0.5,
+    share=0.95,
+    confidence=0.95,
+    pairs=200,
+    within=198,
+    first=0,
+    mean=(0.2, 0.19, 0.21),
+    psnr=47.0,
+    asset_psnr=35.0,
+    distribution={"environments": ["00"], "height": 64, "seed": 0},
+    original="a",
+    asset="b",
+)
+
+
+def asset(text: str) -> GaussianSequence:
+    one = GaussianCloud(
+        positions=np.zeros((1, 3)), orientations=[[0, 0, 0, 1]], scales=np.ones((1, 3)), opacities=np.ones(1)
+    )
+    return GaussianSequence.from_clouds([one], metadata={KEY: text})
+
+
+def test_the_least_share_is_that_of_a_binomial_law():
+    assert least_share(200, 200, 0.95) == pytest.approx(0.05 ** (1 / 200))
+    share = least_share(190, 200, 0.9)
+    assert binom.sf(189, 200, share) == pytest.approx(0.1)  # so many or more, were the share no larger
+
+
+def test_shares_are_covered_as_often_as_is_stated():
+    rng, true = np.random.default_rng(0), 0.97
+    held = [least_share(int(rng.binomial(200, true)), 200, 0.95) <= true for _ in range(2000)]
+    assert np.mean(held) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 2000)
+
+
+def test_independent_errors_as_large_as_those_there_cost_three_decibels():
+    assert loss_of(np.array([35.0]))[0] == pytest.approx(10.0 * np.log10(2.0))
+
+
+def test_a_certificate_reads_back():
+    assert Certificate.of(asset(SOUND.as_metadata()[KEY])) == SOUND
+    assert Certificate.of(replace(asset(""), metadata={})) is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"pairs": 10**9},
+        {"pairs": "many"},
+        {"bound": float("nan")},
+        {"measure": "ssim"},
+        {"mean": [1.0]},
+        {"mean": None},
+        {"distribution": {}},
+        {"distribution": 3},
+        {"first": -1},
+        {"confidence": 1.0},
+        {"more": 1},
+    ],
+)
+def test_damaged_certificates_are_refused(changes):
+    with pytest.raises(AssetFormatError, match="relit_certificate must be a certificate"):
+        Certificate.of(asset(json.dumps({**asdict(SOUND), **changes})))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 5000, "null"])
+def test_what_is_no_certificate_is_refused(text):
+    with pytest.raises(AssetFormatError, match="relit_certificate must be a certificate"):
+        Certificate.of(asset(text))
+
+
+class TestTrials:
+    def test_halves_share_no_draw_and_numbers_repeat(self):
+        trials = RelitTrials([GREY], seed=3)
+        search, other = (trials.draw(half, range(50), range(7)) for half in ("search", "certificate"))
+        assert not set(search) & set(other)
+        assert trials.draw("search", range(10, 50), range(7)) == search[10:]
+
+    def test_lights_are_those_of_the_page(self):
+        draws = RelitTrials([GREY, GREY.scaled(5.0)]).draw("search", range(4000), range(3))
+        lamps = [draw.lamp for draw in draws]
+        for lamp, share in (("none", 0.5), ("sun", 0.25), ("sphere", 0.25)):
+            assert lamps.count(lamp) / 4000 == pytest.approx(share, abs=4.0 * np.sqrt(share * (1 - share) / 4000))
+        height = np.sin(np.radians([draw.elevation for draw in draws]))
+        low, high = np.sin(np.radians([-20.0, 75.0]))
+        assert height.mean() == pytest.approx((low + high) / 2, abs=4.0 * (high - low) / np.sqrt(12 * 4000))
+
+    @pytest.mark.parametrize("lights", [[], [GREY] * 5, [EnvironmentMap.constant((0.0, 0.0, 0.0))]])
+    def test_no_light_and_too_many_are_refused(self, lights):
+        with pytest.raises(InvalidOptionError, match="environment must"):
+            RelitTrials(lights)
