@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from beam_warp.converters.player import write_player
 from beam_warp.converters.staging import folders_made, require_writable
 from beam_warp.errors import InvalidOptionError
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.lights import lights_to_json
 
 if TYPE_CHECKING:
@@ -45,13 +45,9 @@ def publish(
     if page.suffix.lower() != ".html":
         raise InvalidOptionError(f"output's name must end in .html for --player, got {page.name}. Rename it.")
     require_writable(page, is_made=True)
-    lights = {name: read_light() for name, read_light in environments(command.environment).items()}
-    view: Mapping[str, Any] = {}
-    if _is_stage(command.input):
-        sequence, view, own = _staged(command.input)
-        lights = {**own, **lights}
-    else:
-        sequence = read()
+    offered = environments(command.environment)
+    sequence, view, own = _staged(command.input) if _is_stage(command.input) else (read(), {}, {})
+    lights = {**own, **{name: read_light() for name, read_light in offered.items()}}
     with tempfile.TemporaryDirectory() as folder, folders_made(page.parent):
         take = command.input
         if suffix_of(take.name) != ".b4d":
@@ -80,15 +76,21 @@ def _is_stage(path: Path) -> bool:
 
 def _staged(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str, EnvironmentMap]]:
     """Return a stage as one take, what its page shows first, and its light by name."""
+    from beam_warp.stage.discs import discs_of
     from beam_warp.stage.stage import Stage
 
     stage = Stage.read(path)
+    mesh = stage.mesh
+    floor = None if mesh is None or mesh.catches_shadows.all() else discs_of(mesh)
+    notes = stage.notes
+    if mesh is not None and mesh.catches_shadows.any():
+        notes = (*notes, "what only catches shadows is left out")
     sequence = GaussianSequence(
         stage.frame_count,
-        lambda frame: stage.cloud_at(stage.time_of(frame)),
+        lambda frame: _with(stage.cloud_at(stage.time_of(frame)), floor),
         frames_per_second=stage.rate,
         topology="constant" if all(_is_constant(asset) for asset in stage.assets) else "perFrame",
-        metadata={**stage.raster_metadata, "notes": "\n".join(stage.notes)},
+        metadata={**stage.raster_metadata, "notes": "\n".join(notes)},
     )
     light = stage.environment
     name = f"{path.stem} (stage)"
@@ -100,6 +102,12 @@ def _staged(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str, Env
         "cameras": [_pose(stage, frame) for frame in range(stage.frame_count)],
     }
     return sequence, view, {} if light is None else {name: light.map}
+
+
+def _with(cloud: GaussianCloud, floor: GaussianCloud | None) -> GaussianCloud:
+    from beam_warp.stage.assets import joined
+
+    return cloud if floor is None else joined([cloud, floor])
 
 
 def _is_constant(asset: StageAsset) -> bool:

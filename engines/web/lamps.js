@@ -10,9 +10,10 @@ const linearOf = (hex) => [1, 3, 5].map((k) => toLinear(parseInt(hex.slice(k, k 
 const hexOf = (rgb) => `#${rgb.map((v) => Math.round(255 * toDisplay(v)).toString(16).padStart(2, "0")).join("")}`;
 const rounded = (value) => Number(value.toPrecision(2));
 
-/** Return a new lamp to the subject's left front that shines on it with an irradiance of about π. */
-export function newLamp(kind, {center, extent}) {
-  const offset = [-0.35, -0.3, 0.25].map((share) => share * extent), isSun = kind === "directional";
+/** Return a new lamp that shines on the subject with an irradiance of about π: the first to its left front, others around. */
+export function newLamp(kind, {center, extent}, others = 0) {
+  const [s, c] = [Math.sin(1.3 * others), Math.cos(1.3 * others)], isSun = kind === "directional";
+  const offset = [-0.35 * c + 0.3 * s, -0.35 * s - 0.3 * c, 0.25].map((share) => share * extent);
   return {kind, position: add(center, offset), target: [...center], color: "#ffffff", power: rounded(Math.PI * (isSun ? 1 : dot(offset, offset))),
     size: isSun ? 0.53 : rounded(0.03 * extent), cone: 60, shadows: true};
 }
@@ -49,7 +50,7 @@ export class Lamps {
     for (const lamp of lamps) this.insert(lamp);
   }
 
-  add(kind) { if (this.box && this.lamps.length < MOST_LAMPS) this.insert(newLamp(kind, this.box)); }
+  add(kind) { if (this.box && this.lamps.length < MOST_LAMPS) this.insert(newLamp(kind, this.box, this.lamps.length)); }
 
   insert(lamp) {
     const entry = {lamp, number: ++this.count};
@@ -58,7 +59,7 @@ export class Lamps {
     entry.handles = [["position", name], ...(lamp.kind === "point" ? [] : [["target", `Target of ${name}`]])]
       .map(([field, label]) => this.handle(entry, field, label));
     entry.row = this.controls(entry, name);
-    this.list.append(entry.row);
+    this.list.prepend(entry.row);
     this.lamps.push(entry);
     this.changed();
   }

@@ -7,16 +7,13 @@ export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 export const length = (a) => Math.hypot(...a);
 
-/** Return the box of a take's Gaussians without strays, over its first, middle and last frame, in the z-up world [m]. */
-export async function bounds(take) {
-  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity], {frames, count} = take.manifest;
-  for (const number of new Set([0, frames >> 1, frames - 1])) {
-    const {positions} = await take.frame(number).catch(() => take.still);
-    [0, 2, 1].forEach((from, axis) => { // x right, y up, z back: the world's y is -z, and its z is y
-      const values = positions.slice(from * count, (from + 1) * count).sort(), sign = from === 2 ? -1 : 1;
-      const ends = [0.005, 0.995].map((share) => sign * (values[Math.round(share * (count - 1))] ?? sign));
-      low[axis] = Math.min(low[axis], ...ends), high[axis] = Math.max(high[axis], ...ends);
-    });
+/** Return the box of a take's first frame without strays, in the z-up world [m]. */
+export function bounds(take) {
+  const {positions} = take.still, count = take.manifest.count, low = [], high = [];
+  for (const from of [0, 2, 1]) { // x right, y up, z back: the world's y is -z, and its z is y
+    const values = positions.slice(from * count, (from + 1) * count).sort(), sign = from === 2 ? -1 : 1;
+    const ends = [0.005, 0.995].map((share) => sign * (values[Math.round(share * (count - 1))] ?? sign * (share - 0.5)));
+    low.push(Math.min(...ends)), high.push(Math.max(...ends));
   }
   const center = low.map((value, k) => 0.5 * (value + high[k]));
   return {low, high, center, extent: Math.max(length(add(high, low, -1)), 1e-3)};
@@ -38,7 +35,7 @@ export class Orbit {
 
   /** Look at a box from the front, so that it fills what is free of the page. */
   frame(box, {width, height}) {
-    Object.assign(this, {azimuth: 0, elevation: ELEVATION, target: box.center});
+    Object.assign(this, {azimuth: 0, elevation: ELEVATION, target: box.center, isFramed: true});
     const up = Math.tan(0.5 * FIELD_OF_VIEW) * height / this.canvas.clientHeight / MARGIN, {right, down, forward} = this.axes();
     let distance = 1e-3;
     for (let corner = 0; corner < 8; corner++) {
@@ -100,6 +97,7 @@ export class Orbit {
   }
 
   turn(azimuth, elevation) {
+    this.isFramed = false;
     this.azimuth += azimuth;
     this.elevation = Math.max(-STEEPEST, Math.min(STEEPEST, this.elevation + elevation));
     this.moved();
@@ -107,11 +105,13 @@ export class Orbit {
 
   pan(x, y) {
     const {right, down} = this.axes(), share = 2 * this.distance * Math.tan(0.5 * FIELD_OF_VIEW) / this.canvas.clientHeight;
+    this.isFramed = false;
     this.target = add(add(this.target, right, -share * x), down, -share * y);
     this.moved();
   }
 
   zoom(factor) {
+    this.isFramed = false;
     this.distance = Math.max(0.02 * (this.size ?? 1), Math.min(50 * (this.size ?? 1), this.distance * factor));
     this.moved();
   }

@@ -4,15 +4,16 @@
  */
 import {Take} from "./b4d.js";
 import {download, element} from "./elements.js";
+import {Environment} from "./environment.js";
 import {Lamps, fromLight} from "./lamps.js";
 import {Orbit, bounds} from "./orbit.js";
-import {Environment, Relight} from "./relight.js";
+import {Relight} from "./relight.js";
 import {enterVr, hasVr} from "./vr.js";
 
 const CHANNELS = {relit: "lit", base_color: "base colour", roughness: "roughness", ambient_occlusion: "ambient occlusion",
   normals: "normals", depth: "depth", alpha: "alpha", radiance: "captured colour"};
 const TRANSFORMS = ["standard", "aces", "agx", "neutral"];
-const NONE = "none", SCALES = [1, 0.75, 0.5, 0.35, 0.25], SLOW = 80, FAST = 24, STILL = 200;
+const NONE = "none", SCALES = [1, 0.75, 0.5, 0.35, 0.25], SHADOWS = [1024, 1024, 512, 256, 256], SLOW = 80, FAST = 24, STILL = 200;
 const ASK_FOR_FILE = "Choose the .b4d file here, or serve the folder: python3 -m http.server";
 
 /** Return the function that reads ranges of a take that a page holds as base64. */
@@ -22,9 +23,6 @@ function rangesOfText(text) {
     return Uint8Array.from(packed, (letter) => letter.charCodeAt(0)).subarray(start - 3 * first, start - 3 * first + size);
   };
 }
-
-const rangesOfFile = (file) => async (name, start, size) =>
-  new Uint8Array(await file.slice(start, start + size).arrayBuffer());
 
 const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 
@@ -41,7 +39,7 @@ export class Player {
   constructor(root, settings) {
     const {view = {}} = settings;
     Object.assign(this, {root, settings, scale: 0, lastMove: 0, environments: new Map()});
-    this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: NONE, rotation: 0, exposure: 0,
+    this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: null, rotation: 0, exposure: 0,
       transform: "standard", background: "#212121", path: Boolean(view.cameras), ...view.state};
     this.canvas = element("canvas", {tabIndex: 0, ariaLabel: "The take. Drag or use the arrow keys to orbit."});
     this.overlay = document.createElementNS("http://www.w3.org/2000/svg", "svg");
@@ -60,17 +58,25 @@ export class Player {
     } catch (error) {
       return this.say(`This page needs WebGPU or WebGL 2, and this browser offers neither (${error.message}).`, true);
     }
+    const light = this.choose(this.state.environment ?? Object.keys(this.offered())[0]);
     await this.open(this.source());
-    await this.choose(this.state.environment in this.offered() ? this.state.environment : Object.keys(this.offered())[0]);
+    await light;
+    this.isLit = true;
+    this.busy(false);
+    this.wake();
     this.vrButton.hidden = !(await hasVr());
   }
 
   async makeCore(backend = this.settings.backend) {
     this.relight = await Relight.create(this.canvas, backend ? {backend} : {});
-    this.relight.addEventListener("lost", () => this.say("The graphics device was lost. The picture stands still.", true, "Start again",
+    const on = (name, act) => this.relight.addEventListener(name, ({detail}) => act(detail));
+    on("lost", ({message}) => this.say(`The graphics device was lost, and the picture stands still (${message}).`, true, "Start again",
       () => location.reload()));
-    this.relight.addEventListener("stalled", ({detail}) => this.stall(detail));
-    this.relight.addEventListener("error", ({detail}) => this.say(detail?.message ?? String(detail)));
+    on("restored", () => { this.hush(); this.wake(); });
+    on("stalled", ({segment, message}) => this.stall(this.take?.manifest.segments[segment], message));
+    on("resumed", () => { this.hush(); this.wake(); });
+    on("sorted", () => this.wake());
+    on("error", ({message}) => this.say(message));
   }
 
   /** Return how the page's own take is read. */
@@ -79,15 +85,16 @@ export class Player {
     return id ? {url: "take.b4d", read: rangesOfText(document.getElementById(id).textContent)} : {url: new URL(url, location).href};
   }
 
-  async open({url, read, name}) {
+  /** Open a file that was chosen, or what `source` returns. */
+  async open(source, name) {
     this.busy(true);
     try {
-      const take = await Take.open(url, read);
+      const take = await (source instanceof Blob ? Take.from(source) : Take.open(source.url, source.read));
       await this.relight.open(take);
       this.take = take;
-      this.stalled = null;
+      this.settled = null;
       if (name) document.title = this.title.textContent = name;
-      this.box = await bounds(take);
+      this.box = bounds(take);
       this.lamps.place(this.box);
       if (!name) this.lamps.set((this.settings.view?.lights ?? []).map((light) => fromLight(light, this.box)));
       this.orbit.frame(this.box, this.free());
@@ -95,17 +102,19 @@ export class Player {
       this.hush();
       this.change({time: 0, playing: this.state.playing || (this.frames > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches)});
     } catch (error) {
-      const isFile = location.protocol === "file:" && !read;
+      const isFile = location.protocol === "file:" && source.url && !source.read;
       const why = isFile ? "this page was opened from a file, and browsers do not let such pages read others" : error.message;
       this.say(`The take cannot be shown: ${why.replace(/\.$/, "")}.${isFile ? ` ${ASK_FOR_FILE}` : ""}`, true, "Open a file",
         () => this.picker.click());
     }
-    this.busy(false);
+    this.busy(!this.isLit);
   }
 
+  get isReady() { return Boolean(this.take && this.isLit); }
   get frames() { return this.take?.manifest.frames ?? 1; }
   get frameRate() { return this.take?.manifest.rate || 30; }
   get length() { return this.frames / this.frameRate; }
+  get shownTime() { return Math.min(this.state.time, (this.frames - 1) / this.frameRate); }
   get frame() { return Math.min(this.frames - 1, Math.floor(this.state.time * this.frameRate + 1e-6)); }
 
   /** Change the state; controls and picture follow. */
@@ -131,7 +140,7 @@ export class Player {
     const given = this.offered()[name];
     try {
       if (given?.hdr) this.environments.set(name, await Environment.load(bytesOf(given.hdr)));
-      this.relight.environment = this.environments.get(name) ?? null;
+      this.relight.environment = this.environments.get(name) ?? await Environment.constant([0, 0, 0]);
       this.change({environment: name});
     } catch (error) {
       this.say(`The environment ${name} cannot be shown: ${error.message}`);
@@ -149,17 +158,28 @@ export class Player {
     this.wake();
   }
 
-  wake() { this.pending ??= requestAnimationFrame((now) => { this.pending = null; this.tick(now); }); }
+  wake(isChanged = true) {
+    this.isChanged ||= isChanged;
+    this.pending ??= requestAnimationFrame((now) => { this.pending = null; this.tick(now); });
+  }
 
-  tick(now) {
-    if (!this.relight || !this.take || this.vr) return;
-    const passed = Math.min((now - (this.lastTick ?? now)) / 1000, 0.25), moves = this.state.playing || now - this.lastMove < STILL;
+  /** Draw if anything changed: coarse where the device is slow and something moves, then finer, then in full. */
+  async tick(now) {
+    if (!this.isReady || this.vr || this.isDrawing) return;
+    const passed = Math.min((now - (this.lastTick ?? now)) / 1000, 0.25), rest = this.state.playing ? 0 : now - this.lastMove;
     if (this.state.playing) this.advance(passed);
-    this.adapt(1000 * passed, moves);
-    this.draw(moves ? SCALES[this.scale] : 1);
-    this.lastTick = moves ? now : null;
-    if (moves) this.wake();
-    this.tell(passed);
+    const step = rest < STILL ? this.scale : rest < 5 * STILL ? Math.max(this.scale - 2, 0) : 0, isDue = this.isChanged || this.state.playing;
+    [this.lastTick, this.isChanged] = [rest < STILL ? now : null, false];
+    if (isDue || step !== this.drawn) {
+      this.isDrawing = true;
+      this.draw(SCALES[step], SHADOWS[step]);
+      const milliseconds = await finished(this.relight.gpu);
+      this.isDrawing = false;
+      if (step === this.scale && isDue) this.adapt(milliseconds);
+      this.drawn = step;
+      this.tell(milliseconds);
+    }
+    if (rest < STILL || step || this.isChanged) this.wake(false);
   }
 
   advance(seconds) {
@@ -170,37 +190,43 @@ export class Player {
   }
 
   /** Lower the resolution where pictures are late, and raise it where they are early. */
-  adapt(milliseconds, moves) {
-    if (!moves || !this.lastTick) return;
-    this.pace = 0.8 * (this.pace ?? milliseconds) + 0.2 * milliseconds;
+  adapt(milliseconds) {
+    this.pace = 0.7 * (this.pace ?? milliseconds) + 0.3 * milliseconds;
     const step = this.pace > SLOW ? 1 : this.pace < FAST ? -1 : 0, scale = Math.max(0, Math.min(SCALES.length - 1, this.scale + step));
-    if (scale !== this.scale && now() - (this.lastStep ?? 0) > 700) [this.scale, this.lastStep, this.pace] = [scale, now(), null];
+    if (scale !== this.scale && now() - (this.lastStep ?? 0) > 500) [this.scale, this.lastStep, this.pace] = [scale, now(), null];
   }
 
-  draw(scale = 1) {
+  draw(scale = 1, shadows = SHADOWS[0]) {
     const size = scale * Math.min(devicePixelRatio || 1, 2), width = Math.round(this.root.clientWidth * size);
     const height = Math.round(this.root.clientHeight * size);
     if (!width || !height) return;
-    this.relight.time = Math.min(this.state.time, (this.frames - 1) / this.frameRate);
+    Object.assign(this.relight, {time: this.shownTime, shadowMapSize: shadows});
     if (this.settings.view?.degreesPerSecond) this.relight.rotation = this.rotation;
     const pose = this.state.path && this.settings.view.cameras[this.frame];
     const camera = pose ? this.orbit.posed(pose, width, height) : this.orbit.camera(width, height, this.free());
     this.relight.draw(camera);
     this.lamps.show(this.orbit.camera(this.root.clientWidth, this.root.clientHeight, this.free(), pose));
-    this.relight.ready().then((late) => { if (late) this.wake(); }, () => {});
+    this.settle();
+  }
+
+  /** Draw again once the segment of the moment is here. */
+  async settle() {
+    const key = this.relight.time;
+    if (this.settled === key) return;
+    this.settled = key;
+    await this.relight.ready();
+    if (this.settled === key) this.wake();
   }
 
   /** Return the part of the page that no panel covers, from its left upper corner. */
   free() {
-    const {clientWidth: width, clientHeight: height} = this.root, panel = this.side.getBoundingClientRect();
+    const {clientWidth: width} = this.root, panel = this.side.getBoundingClientRect(), {top: height} = this.bar.getBoundingClientRect();
     if (this.side.hidden) return {width, height};
     return panel.width < 0.8 * width ? {width: panel.left, height} : {width, height: panel.top};
   }
 
-  stall({first, frames, message} = {}) {
-    this.stalled = first;
-    const which = first === undefined ? "A part of the take" : `Frames ${first + 1} to ${first + frames}`;
-    this.say(`${which} cannot be read; the last frame is held. ${message ?? ""}`);
+  stall({first, frames}, message) {
+    this.say(`Frames ${first + 1} to ${first + frames} cannot be read; the last frame is held (${message.replace(/\.$/, "")}).`);
   }
 
   say(text, isFatal = false, word = "", act = null) {
@@ -213,10 +239,10 @@ export class Player {
   hush() { this.message.hidden = true; }
   busy(is) { this.root.classList.toggle("busy", is); }
 
-  tell(passed) {
-    const rate = passed && this.state.playing ? ` · ${Math.round(1 / passed)} pictures/s` : "";
-    const words = `${this.take.manifest.count.toLocaleString("en")} Gaussians · ${this.relight.backend === "webgpu" ? "WebGPU" : "WebGL 2"}`;
-    if (now() - (this.lastWords ?? 0) > 500) [this.status.textContent, this.lastWords] = [words + rate, now()];
+  tell(milliseconds) {
+    const words = [`${this.take.manifest.count.toLocaleString("en")} Gaussians`, this.relight.backend === "webgpu" ? "WebGPU" : "WebGL 2",
+      `${milliseconds < 10 ? milliseconds.toFixed(1) : Math.round(milliseconds)} ms`];
+    if (now() - (this.lastWords ?? 0) > 500) [this.status.textContent, this.lastWords] = [words.join(" · "), now()];
   }
 
   // the page
@@ -244,9 +270,9 @@ export class Player {
     const more = element("button", {className: "more", ariaLabel: "Controls", ariaExpanded: String(!this.side.hidden), onclick: () => {
       this.side.hidden = !this.side.hidden;
       more.ariaExpanded = String(!this.side.hidden);
-      this.wake();
+      this.resized();
     }});
-    return element("nav", {ariaLabel: "Time"}, ...this.timeControls, element("span", {className: "gap"}), this.vrButton, full, more);
+    return this.bar = element("nav", {ariaLabel: "Time"}, ...this.timeControls, element("span", {className: "gap"}), this.vrButton, full, more);
   }
 
   panel() {
@@ -337,8 +363,13 @@ export class Player {
     });
     addEventListener("dragover", (event) => event.preventDefault());
     addEventListener("drop", (event) => { event.preventDefault(); this.take_(event.dataTransfer.files); });
-    new ResizeObserver(() => this.moved()).observe(this.root);
+    new ResizeObserver(() => this.resized()).observe(this.root);
     this.change({background: this.state.background});
+  }
+
+  resized() {
+    if (this.orbit.isFramed && this.box) this.orbit.frame(this.box, this.free());
+    this.moved();
   }
 
   step(frames) {
@@ -348,7 +379,7 @@ export class Player {
   /** Open files that were chosen or dropped: a take, environments. */
   async take_(files) {
     for (const file of files) {
-      if (file.name.endsWith(".b4d")) await this.open({url: file.name, read: rangesOfFile(file), name: file.name.slice(0, -4)});
+      if (file.name.endsWith(".b4d")) await this.open(file, file.name.slice(0, -4));
       else await this.addEnvironment(file);
     }
   }
@@ -387,5 +418,18 @@ export class Player {
 }
 
 const now = () => performance.now();
+
+/** Wait until the graphics device is done with what it was given; returns how long that took [ms]. */
+async function finished({device, gl}) {
+  const began = now();
+  if (device) await device.queue.onSubmittedWorkDone();
+  else {
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (fence && gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.UNSIGNALED) await new Promise((go) => setTimeout(go, 2));
+    gl.deleteSync(fence);
+  }
+  return now() - began;
+}
 
 const group = (name, open, ...children) => element("details", {open}, element("summary", {textContent: name}), ...children);

@@ -1,5 +1,5 @@
 /**
- * Playback in a headset by WebXR: the core draws what each eye sees into its canvas, from where it goes to the headset.
+ * Playback in a headset by WebXR: the core draws what each eye sees.
  * The subject stands before the viewer in its true size. Sticks turn it and bring it nearer; the trigger pauses.
  */
 import {Relight} from "./relight.js";
@@ -20,7 +20,7 @@ export async function enterVr(player) {
     await gl.makeXRCompatible();
     const layer = new XRWebGLLayer(session, gl, {antialias: false, alpha: false, depth: false});
     await session.updateRenderState({baseLayer: layer});
-    player.vr = new Headset(player, session, space, layer, relight, gl);
+    player.vr = new Headset(player, session, space, layer, relight);
   } catch (error) {
     await session.end();
     throw error;
@@ -37,9 +37,9 @@ async function coreFor(player) {
 }
 
 class Headset {
-  constructor(player, session, space, layer, relight, gl) {
+  constructor(player, session, space, layer, relight) {
     const {low, center, extent} = player.box;
-    Object.assign(this, {player, session, space, layer, relight, gl, turn: 0, base: [center[0], center[1], low[2]], away: Math.max(1, extent)});
+    Object.assign(this, {player, session, space, layer, relight, turn: 0, base: [center[0], center[1], low[2]], away: Math.max(1, extent)});
     session.addEventListener("select", () => player.change({playing: !player.state.playing}));
     session.addEventListener("end", () => this.end());
     session.requestAnimationFrame((time, frame) => this.tick(time, frame));
@@ -65,13 +65,9 @@ class Headset {
     }
   }
 
-  drawEye(view, {x, y, width, height}) {
-    const {gl, layer} = this;
-    this.relight.draw(eye(view, width, height, this));
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, layer.framebuffer);
-    gl.blitFramebuffer(0, 0, width, height, x, y, x + width, y + height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  drawEye(view, port) {
+    const target = {framebuffer: this.layer.framebuffer, x: port.x, y: port.y, width: port.width, height: port.height};
+    this.relight.draw({...eye(view, port.width, port.height, this), name: view.eye, target});
   }
 
   end() {
