@@ -71,6 +71,13 @@ export class Take {
     return take;
   }
 
+  /** Open a `.b4d` file that is at hand: its bytes, or a Blob; a page needs no server for it. */
+  static async from(content) {
+    const blob = content instanceof Blob ? content : new Blob([content]);
+    const read = async (_, start, size) => new Uint8Array(await blob.slice(start, start + size).arrayBuffer());
+    return Take.open("bytes.b4d", read);
+  }
+
   /** Return the arrays of a block, after one request; `entry` is `manifest.static` or one of `manifest.segments`. */
   async tracks(entry, frames) {
     const [name, start] = this.isArchive ? [null, this.start + entry.offset] : [entry.file, 0];

@@ -1,0 +1,552 @@
+/**
+ * The renderer: draws a take as Gaussians whose materials are lit, under any environment and lamps.
+ *
+ *     const relight = await Relight.create(canvas);
+ *     await relight.open(await Take.open("person.b4d"));
+ *     relight.environment = await Environment.load("studio.hdr");
+ *     await relight.render(camera);
+ *
+ * Planes of the container stay on the GPU, which evaluates frames and the blends between them. The world is beam_warp's:
+ * metres, z up; cameras are right, down, forward. docs/engines/web.md describes all of it.
+ */
+
+import {Environment} from "./environment.js";
+import {GpuError, WebGL2, WebGPU} from "./gpu.js";
+import {checkedLights, depthRow, lampNumbers, mapNumbers, shadowViews} from "./lights.js";
+import * as passes from "./shaders.js";
+import {GLSL, GLSL_FETCHING, WGSL, WGSL_FETCHING} from "./shading.js";
+import {sorter} from "./sorting.js";
+
+const {ROW, ORDER, CHANNELS, BINS} = passes;
+const MAX_LAYERS = 256, LAYER_ROWS = 2048, KEPT_SEGMENTS = 3, RETRY_MS = 2000, THICKEST = 0.02;
+const SHADOW_FILTERS = [0.1, 0.01, 1, 0], FAR_AWAY = 3e38;
+/** What stands for arrays that a container lacks. */
+const DEFAULTS = {base_color: [0.5, 0.5, 0.5], roughness: [0.5], ambient_occlusion: [1]};
+const TRANSFORMS = ["standard", "aces", "agx", "neutral"];
+
+/** Something that is asked of the renderer breaks its contract; the message says what. */
+export class RelightError extends Error {}
+
+function require(condition, contract, got) {
+  if (!condition) throw new RelightError(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`);
+}
+
+const numbers = (list, count) => list?.length === count && Array.from(list).every(Number.isFinite);
+
+/** A camera as the passes take it. */
+function viewOf(camera) {
+  const {position, worldToCamera: m, focal, center, width, height} = camera;
+  require(numbers(position, 3) && numbers(m, 9), "camera must have a position and nine numbers worldToCamera", [position, m]);
+  require(numbers(focal, 2) && numbers(center, 2) && focal[0] > 0 && focal[1] > 0, "camera must have focal and center [pixel]", [focal, center]);
+  require([width, height].every((side) => Number.isInteger(side) && side > 0), "camera must have a width and height [pixel]", [width, height]);
+  const rows = [0, 3, 6].map((k) => Array.from(m).slice(k, k + 3));
+  return {position: Array.from(position), right: rows[0], down: rows[1], forward: rows[2], focal, center, width, height};
+}
+
+const cameraNumbers = (view, count) => ({
+  right: view.right, down: view.down, forward: view.forward, eye: view.position,
+  lens: [...view.focal, ...view.center], image: [view.width, view.height, 0, count],
+});
+
+/** A renderer of one canvas. Events: sorted, stalled, resumed, lost, restored, error. */
+export class Relight extends EventTarget {
+  #programs; #textures = {}; #sorter; #segments = new Map(); #loading = new Map(); #failed = new Map();
+  #take = null; #time = 0; #evaluated = null; #views = new Map(); #maps = {key: null, views: [], drawn: null}; #casters = null;
+  #environment = null; #lights = []; #lightsVersion = 0; #sorting = null; #isDisposed = false; #isLost = false;
+
+  /**
+   * Return a renderer.
+   * @param {HTMLCanvasElement|OffscreenCanvas} canvas What is drawn on.
+   * @param {{backend?: "webgpu"|"webgl2", context?: WebGL2RenderingContext, device?: GPUDevice, shadowMapSize?: number}} [options]
+   *     By default WebGPU if there is any; a context or a device of another renderer, to share textures with it.
+   */
+  static async create(canvas, {backend, context = null, device = null, shadowMapSize = 1024} = {}) {
+    require([undefined, "webgpu", "webgl2"].includes(backend), "backend must be webgpu or webgl2", backend);
+    require(Number.isInteger(shadowMapSize) && shadowMapSize >= 16 && shadowMapSize <= 8192, "shadowMapSize must be in [16, 8192]", shadowMapSize);
+    const relight = Object.assign(new Relight(), {canvas, shadowMapSize, rotation: 0, exposure: 0, viewTransform: "standard",
+      channel: "relit", background: null, depthRange: null});
+    relight.#environment = await Environment.constant();
+    await relight.#start(async () => {
+      if (backend !== "webgl2" && !context) {
+        try {
+          return await WebGPU.create(canvas, device);
+        } catch (error) {
+          if (backend) throw error;
+        }
+      }
+      return WebGL2.create(canvas, context);
+    });
+    return relight;
+  }
+
+  /** Take a GPU, and bring everything to it. */
+  async #start(makeGpu) {
+    this.gpu = await makeGpu();
+    this.backend = this.gpu.name;
+    const {blendFormat: format} = this.gpu, program = (spec) => this.gpu.program(spec);
+    this.#programs = {
+      geometry: program(passes.geometry), materials: program(passes.materials), gbuffer: program(passes.gbuffer(format)),
+      deferred: program(passes.deferred({glsl: GLSL + GLSL_FETCHING, wgsl: WGSL + WGSL_FETCHING})), display: program(passes.display({glsl: GLSL, wgsl: WGSL}, this.backend === "webgl2")),
+    };
+    this.#textures = {nothing: this.#filled([FAR_AWAY, 0, 0, 0]), noMap: this.gpu.texture({width: 1, height: 1, layers: 1, format: "rgba32float"})};
+    this.#upload(this.#environment);
+    this.gpu.onLost((message) => this.#lost(message));
+  }
+
+  /** Programs that only lamps need are made when there is the first one. */
+  #lampPrograms() {
+    if (this.#programs.depths) return;
+    const program = (spec) => this.gpu.program(spec), {blendFormat} = this.gpu;
+    Object.assign(this.#programs, {
+      depths: program(passes.depths(blendFormat)), bins: program(passes.bins(false)), fineBins: program(passes.bins(true)),
+      pick: program(passes.pick(false)), finePick: program(passes.pick(true)), median: program(passes.median(blendFormat)), texels: program(passes.texels),
+    });
+  }
+
+  #filled(texel) {
+    const texture = this.gpu.texture({width: 1, height: 1, format: "rgba32float"});
+    this.gpu.write(texture, new Float32Array(texel));
+    return texture;
+  }
+
+  /** Return a texture that is made anew only if its size, number of layers or format changes. */
+  #texture(name, width, height, format, layers = 0) {
+    const old = this.#textures[name];
+    if (old && old.width === width && old.height === height && old.layers === layers && old.format === format) return old;
+    this.gpu.destroy(old);
+    return this.#textures[name] = this.gpu.texture({width, height, layers, format});
+  }
+
+  #tell(type, detail) {
+    this.dispatchEvent(new CustomEvent(type, {detail}));
+  }
+
+  // ---- What is lost and comes back
+
+  #lost(message) {
+    if (this.#isDisposed || this.#isLost) return;
+    this.#isLost = true;
+    this.#tell("lost", {message});
+    const again = async () => {
+      try {
+        await this.#start(() => this.backend === "webgpu" ? WebGPU.create(this.canvas) : WebGL2.create(this.canvas, this.gpu.gl));
+        const take = this.#take;
+        if (take) await this.open(take);
+        this.#isLost = false;
+        this.#tell("restored", {backend: this.backend});
+      } catch (error) {
+        this.#tell("error", {error, message: `the GPU must come back, got ${error.message}`});
+      }
+    };
+    if (this.backend === "webgpu") again();
+    else this.canvas.addEventListener("webglcontextrestored", again, {once: true});
+  }
+
+  /** Give back all memory; the renderer cannot be used any more. */
+  dispose() {
+    this.#isDisposed = true;
+    this.#sorter?.end();
+    this.gpu.dispose();
+    this.#segments.clear();
+    this.#take = null;
+  }
+
+  // ---- The take
+
+  /** Show a take of b4d.js from now on; resolves when its static block is on the GPU. */
+  async open(take) {
+    const count = take.manifest.count, rows = Math.max(Math.ceil(count / ROW), 1);
+    require(rows <= this.gpu.maxTextureSide, `count must be at most ${this.gpu.maxTextureSide * ROW} on this GPU`, count);
+    this.#close();
+    this.#take = take;
+    this.#sorter ??= sorter();
+    this.rows = rows;
+    const stored = this.#store(Object.entries(take.raw).filter(([name]) => name in ORDER).flatMap(([name, values]) =>
+      Array.from({length: values.length / Math.max(count, 1)}, (_, c) => [`${name}${c}`, values.subarray(c * count, (c + 1) * count)])), "float");
+    this.#textures.still = stored.texture;
+    this.still = stored.places;
+    for (const name of ["positions", "orientations", "scales", "colors", "normals"]) this.#texture(name, ROW, rows, "rgba32float");
+    this.thickness = middleScale(take.still.scales, count);
+    const still = take.raw.positions.slice(0, 3 * count);
+    await this.#sorter.ask({still, opacities: take.still.opacities, count, row: ROW});
+  }
+
+  #close() {
+    for (const segment of this.#segments.values()) this.#free(segment);
+    this.#segments.clear();
+    this.#loading.clear();
+    this.#failed.clear();
+    for (const view of this.#views.values()) this.gpu.destroy(view.order);
+    this.#views.clear();
+    for (const name of ["still", "none", "noInts"]) this.gpu.destroy(this.#textures[name]);
+    this.#textures.none = this.gpu.texture({width: 1, height: 1, layers: 1, format: "r32float"});
+    this.#textures.noInts = this.gpu.texture({width: 1, height: 1, layers: 1, format: "r8sint"});
+    for (const order of this.#maps.orders ?? []) this.gpu.destroy(order);
+    this.#maps = {key: null, views: [], drawn: null};
+    this.#evaluated = this.#casters = null;
+  }
+
+  #free({summed, plain, number}) {
+    this.gpu.destroy(summed);
+    this.gpu.destroy(plain);
+    this.#sorter.ask({drop: number});
+  }
+
+  /** Put planes into one texture: rows of Gaussians, planes below each other, in layers. */
+  #store(planes, kind) {
+    if (!planes.length) return {texture: null, places: {}};
+    const rows = this.rows, format = kind === "float" ? "r32float" : "r8sint", stack = Math.max(Math.floor(LAYER_ROWS / rows), 1);
+    const layers = Math.ceil(planes.length / stack), height = Math.min(stack, planes.length) * rows;
+    require(layers <= MAX_LAYERS, `a segment must have at most ${MAX_LAYERS * stack} planes`, planes.length);
+    const texture = this.gpu.texture({width: ROW, height, layers, format}), places = {};
+    const padded = new (kind === "float" ? Float32Array : Int8Array)(ROW * rows);
+    planes.forEach(([name, values], k) => {
+      padded.set(values);
+      const layer = Math.floor(k / stack), y = (k % stack) * rows;
+      this.gpu.write(texture, padded, {layer, y, height: rows});
+      places[name] = [y, layer];
+    });
+    return {texture, places};
+  }
+
+  /** Length of the take [s]. */
+  get duration() {
+    return this.#take ? this.#take.manifest.frames / this.#take.manifest.rate : 0;
+  }
+
+  /** Moment that is shown [s]; the take holds its first and last frame outside of its length. */
+  get time() {
+    return this.#time;
+  }
+
+  set time(seconds) {
+    require(Number.isFinite(seconds), "time must be a number of seconds", seconds);
+    this.#time = seconds;
+  }
+
+  /** Return the segment of a moment, the frame in it, and the share of the next one. */
+  #place() {
+    const {manifest} = this.#take, blends = manifest.topology === "constant";
+    const at = Math.min(Math.max(this.#time * manifest.rate, 0), manifest.frames - 1), whole = Math.floor(at);
+    const frame = blends || at === whole ? whole : Math.floor(at), number = manifest.segments.findIndex(({first, frames}) => frame < first + frames);
+    const {first, frames} = manifest.segments[number], local = frame - first;
+    let share = blends ? at - frame : 0;
+    if (local === frames - 1 && share) { // blends end at the last frame of a segment
+      if (share >= 0.5) return {number: number + 1, local: 0, share: 0};
+      share = 0;
+    }
+    return {number, local, share};
+  }
+
+  /** Fetch a segment unless it is here; resolves to it, or to null if it cannot be read. */
+  #load(number) {
+    if (this.#segments.has(number)) return Promise.resolve(this.#segments.get(number));
+    if (performance.now() - (this.#failed.get(number) ?? -Infinity) < RETRY_MS) return Promise.resolve(null);
+    if (!this.#loading.has(number)) this.#loading.set(number, this.#fetch(number, this.#take));
+    return this.#loading.get(number);
+  }
+
+  async #fetch(number, take) {
+    const entry = take.manifest.segments[number];
+    try {
+      const tracks = await take.tracks(entry, entry.frames);
+      if (take !== this.#take || this.#isDisposed || this.#isLost) return null;
+      const named = Object.entries(tracks).filter(([name]) => name in ORDER).flatMap(([name, components]) =>
+        components.flatMap(({planes}, c) => planes.map((values, k) => [`${name}${c}/${k}`, values])));
+      const summed = this.#store(named.filter(([, values]) => values instanceof Float32Array), "float");
+      const plain = this.#store(named.filter(([, values]) => values instanceof Int8Array), "int");
+      const weights = mapped(tracks, (components) => components.map(({columns, weights: all}) => ({columns, weights: all})));
+      const segment = {number, entry, weights, summed: summed.texture, plain: plain.texture, summedPlaces: summed.places, plainPlaces: plain.places};
+      await this.#sorter.ask({segment: number, planes: (tracks.positions ?? [[], [], []]).map(({planes = []}) => planes)});
+      if (take !== this.#take) return null;
+      this.#segments.set(number, segment);
+      if (this.#failed.delete(number)) this.#tell("resumed", {segment: number});
+      this.#forget();
+      return segment;
+    } catch (error) {
+      if (take !== this.#take || this.#isDisposed) return null;
+      this.#failed.set(number, performance.now());
+      this.#tell("stalled", {segment: number, file: entry.file, error, message: error.message});
+      return null;
+    } finally {
+      if (take === this.#take) this.#loading.delete(number);
+    }
+  }
+
+  /** Keep the segments nearest to what is shown. */
+  #forget() {
+    const wanted = this.#place().number, distance = (number) => number >= wanted ? number - wanted : 1.5 * (wanted - number);
+    const far = [...this.#segments.keys()].sort((a, b) => distance(a) - distance(b)).slice(KEPT_SEGMENTS);
+    for (const number of far) {
+      this.#free(this.#segments.get(number));
+      this.#segments.delete(number);
+    }
+  }
+
+  /** Return the sums that give a frame: offsets and terms of every component. */
+  #sums({number, local, share}) {
+    const segment = this.#segments.get(number), heads = new Float32Array(4 * passes.COMPONENTS), terms = [], forSorter = {heads: [0, 0, 0], terms: [[], [], []]};
+    for (const [name, start] of Object.entries(ORDER)) {
+      const size = {opacities: 1, roughness: 1, ambient_occlusion: 1}[name] ?? 3, tracks = segment.weights[name];
+      for (let c = 0; c < size; c++) {
+        const first = terms.length, place = this.still[`${name}${c}`];
+        let offset = place || tracks ? 0 : DEFAULTS[name]?.[c] ?? 0;
+        if (place) terms.push([0, ...place, 1]);
+        if (tracks) {
+          const {columns, weights} = tracks[c], at = local * columns, next = share ? at + columns : at;
+          for (let k = 0; k < columns; k++) {
+            const weight = (1 - share) * weights[at + k] + share * weights[next + k];
+            if (k === 0) offset = weight;
+            else if (weight) {
+              const key = `${name}${c}/${k - 1}`, isSummed = key in segment.summedPlaces;
+              terms.push([isSummed ? 1 : 2, ...(isSummed ? segment.summedPlaces : segment.plainPlaces)[key], weight]);
+              if (name === "positions") forSorter.terms[c].push([k - 1, weight]);
+            }
+          }
+          if (name === "positions") forSorter.heads[c] = offset;
+        }
+        heads.set([offset, first, terms.length - first, 0], 4 * (start + c));
+      }
+    }
+    require(terms.length <= passes.TERMS, `a frame must be a sum of at most ${passes.TERMS} planes`, terms.length);
+    return {heads, terms: terms.flat(), at: {frame: `${number}:${local}:${share}`, segment: number, ...forSorter}};
+  }
+
+  /** Evaluate the wanted frame if its segment is here; ask for it and for the next one otherwise. */
+  #advance() {
+    const place = this.#place(), segment = this.#segments.get(place.number), last = this.#take.manifest.segments.length - 1;
+    this.#load(place.number);
+    if (segment && place.number < last && place.local >= segment.entry.frames / 3) this.#load(place.number + 1);
+    const key = `${place.number}:${place.local}:${place.share}`;
+    if (!segment || this.#evaluated?.key === key) return;
+    const {heads, terms, at} = this.#sums(place), t = this.#textures;
+    const textures = {still: t.still, summed: segment.summed ?? t.none, plain: segment.plain ?? t.noInts}, uniforms = {heads, terms};
+    this.gpu.draw(this.#programs.geometry, {targets: [t.positions, t.orientations, t.scales], uniforms, textures});
+    this.gpu.draw(this.#programs.materials, {targets: [t.colors, t.normals], uniforms, textures});
+    this.#evaluated = {key, at};
+  }
+
+  // ---- Light
+
+  /** Light from all around, an `Environment`; null for darkness. */
+  get environment() {
+    return this.#environment;
+  }
+
+  set environment(environment) {
+    require(environment instanceof Environment, "environment must be an Environment", environment);
+    this.#environment = environment;
+    if (!this.#isLost) this.#upload(environment);
+  }
+
+  #upload({maps, albedo}) {
+    const rgba = (values, from, size) => {
+      const out = new Float32Array(4 * size);
+      for (let i = 0; i < size; i++) for (let c = 0; c < from; c++) out[4 * i + c] = values[from * i + c];
+      return out;
+    };
+    const width = 2 * Math.max(...maps.map(({height}) => height)), total = maps.reduce((sum, {height}) => sum + height, 0);
+    const texture = this.#texture("environment", width, total, "rgba32float"), side = Math.sqrt(albedo.length / 2);
+    this.levels = [];
+    let y = 0;
+    for (const {height, radiance} of maps) {
+      this.gpu.write(texture, rgba(radiance, 3, 2 * height * height), {y, width: 2 * height, height});
+      this.levels.push(height, y, 0, 0);
+      y += height;
+    }
+    this.gpu.write(this.#texture("albedo", side, side, "rgba32float"), rgba(albedo, 2, side * side));
+  }
+
+  /** Lamps: objects of the JSON that `beam render --lights` reads. */
+  get lights() {
+    return this.#lights;
+  }
+
+  set lights(records) {
+    const lights = checkedLights(records);
+    require(lights.length <= passes.LAMPS, `lights must be at most ${passes.LAMPS}`, lights.length);
+    this.#lights = lights;
+    this.#lightsVersion++;
+  }
+
+  // ---- Depth order
+
+  /** Sort for a view, and for the lamps where their maps are old; one request at a time, the newest wins. */
+  #sort(name, exact) {
+    if (!this.#evaluated) return Promise.resolve();
+    const wanted = () => {
+      const view = this.#views.get(name), key = `${this.#evaluated.key}|${depthRow(view.camera)}`, maps = `${this.#evaluated.key}|${this.#lightsVersion}|${this.shadowMapSize}`;
+      return {view, key, maps, isOld: view.sorted !== key || (this.#lights.length > 0 && this.#maps.key !== maps)};
+    };
+    if (this.#sorting) return exact ? this.#sorting.then(() => this.#sort(name, true)) : this.#sorting;
+    const {view, key, maps, isOld} = wanted();
+    if (!isOld) return Promise.resolve();
+    this.#sorting = this.#ask(view, key, maps).catch((error) => {
+      if (!this.#isDisposed && !this.#isLost) this.#tell("error", {error, message: error.message});
+    }).finally(() => { this.#sorting = null; });
+    return this.#sorting;
+  }
+
+  async #ask(view, key, mapsKey) {
+    const {at} = this.#evaluated, take = this.#take, gpu = this.gpu;
+    let mapViews = null;
+    if (this.#lights.length && this.#maps.key !== mapsKey) {
+      const {bulk} = await this.#sorter.ask({at, bulk: true});
+      const [x, y, z] = bulk.center;
+      this.#casters = {center: [x, -z, y], radius: bulk.radius};
+      mapViews = this.#lights.map((light) => shadowViews(light, this.#casters, this.shadowMapSize));
+      require(mapViews.flat().length <= passes.MAPS, `shadow maps must be at most ${passes.MAPS}`, mapViews.flat().length);
+    }
+    const {orders: [order, ...others]} = await this.#sorter.ask({at, views: [view.camera, ...(mapViews?.flat() ?? [])].map(depthRow)});
+    if (take !== this.#take || gpu !== this.gpu || this.#isLost || this.#isDisposed) return;
+    view.order ??= this.gpu.texture({width: ROW, height: this.rows, format: "r32float"});
+    this.gpu.write(view.order, order);
+    view.sorted = key;
+    if (mapViews) {
+      const old = this.#maps.orders ?? [];
+      const orders = others.map((numbersOf, k) => {
+        const texture = old[k] ?? this.gpu.texture({width: ROW, height: this.rows, format: "r32float"});
+        this.gpu.write(texture, numbersOf);
+        return texture;
+      });
+      for (const texture of old.slice(orders.length)) this.gpu.destroy(texture);
+      this.#maps = {key: mapsKey, views: mapViews, orders, drawn: false, lights: this.#lights};
+    }
+    this.#tell("sorted", {key});
+  }
+
+  // ---- Drawing
+
+  /** What splats are drawn with: uniforms and textures of a view. */
+  #splats(view, order, filters) {
+    const t = this.#textures;
+    return {
+      uniforms: {...cameraNumbers(view, this.#take.manifest.count), filters},
+      textures: {order, positions: t.positions, orientations: t.orientations, scales: t.scales, colors: t.colors, normals: t.normals},
+      instances: this.#take.manifest.count || null,
+    };
+  }
+
+  /** Find median depths of a view: sums of depth times alpha, and of alpha. */
+  #median(view, order, filters, name) {
+    const {gpu} = this, p = this.#programs, {width, height} = view, size = Math.max(Math.ceil(this.#take.manifest.count / BINS), 1);
+    const splats = this.#splats(view, order, filters), uniforms = {...splats.uniforms, sizes: [size, Math.max(Math.ceil(size / BINS), 1), 0, 0]};
+    const bins = [0, 1, 2, 3].map((k) => this.#texture(`bins${k}`, width, height, "rgba16float"));
+    const [coarse, fine] = ["coarse", "fine"].map((each) => this.#texture(each, width, height, "rgba32float"));
+    const found = Object.fromEntries(bins.map((texture, k) => [`bins${k}`, texture])), out = this.#texture(name, width, height, this.gpu.blendFormat);
+    const run = (program, targets, clear, picked) => gpu.draw(program, {...splats, uniforms, targets, clear, textures: {...splats.textures, picked}});
+    run(p.bins, bins, [1, 1, 1, 1]);
+    gpu.draw(p.pick, {targets: [coarse], textures: found});
+    run(p.fineBins, bins, [1, 1, 1, 1], coarse);
+    gpu.draw(p.finePick, {targets: [fine], textures: {...found, picked: coarse}});
+    run(p.median, [out], [0, 0, 0, 0], fine);
+    return out;
+  }
+
+  #drawMaps() {
+    const views = this.#maps.views.flat(), size = this.shadowMapSize;
+    if (this.#maps.drawn || !views.length) return;
+    const shadows = this.#texture("shadows", size, size, "rgba32float", views.length);
+    views.forEach((view, k) => {
+      const order = this.#maps.orders[k], sums = this.#texture("shadowSums", size, size, this.gpu.blendFormat);
+      this.gpu.draw(this.#programs.depths, {...this.#splats(view, order, SHADOW_FILTERS), targets: [sums], clear: [0, 0, 0, 0]});
+      const medians = this.#median(view, order, SHADOW_FILTERS, "shadowMedians");
+      const meshes = this.meshDepth?.(view, k) ?? this.#textures.nothing;
+      this.gpu.draw(this.#programs.texels, {targets: [[shadows, k]], textures: {sums, medians, meshes}});
+    });
+    this.#maps.drawn = true;
+  }
+
+  /** Draw what is at hand now, lit, into textures: true if there is anything. */
+  shade(camera) {
+    if (this.#isLost || this.#isDisposed || !this.#take) return false;
+    const view = viewOf(camera), name = camera.name ?? "main", {width, height} = view;
+    this.#advance();
+    if (!this.#views.has(name)) this.#views.set(name, {});
+    Object.assign(this.#views.get(name), {camera: view});
+    this.#sort(name, false);
+    const {order} = this.#views.get(name);
+    if (!order || !this.#evaluated) return false;
+    const t = this.#textures, format = this.gpu.blendFormat, {raster_low_pass: low, raster_antialiased: thin} = this.#take.manifest.metadata ?? {};
+    const filters = [Number(low) > 0 ? Number(low) : 0.3, 0.01, thin === "true" ? 1 : 0, 0];
+    const sums = [0, 1, 2].map((k) => this.#texture(`sums${k}`, width, height, format));
+    this.gpu.draw(this.#programs.gbuffer, {...this.#splats(view, order, filters), targets: sums, clear: [0, 0, 0, 0]});
+    const lights = this.#lights.length ? this.#maps.lights ?? [] : [], hasLamps = lights.length > 0; // those that maps are of
+    if (hasLamps) {
+      this.#lampPrograms();
+      this.#drawMaps();
+    }
+    const medians = hasLamps ? this.#median(view, order, filters, "medians") : t.nothing;
+    let first = 0;
+    const lamps = lights.flatMap((light, k) => {
+      const maps = this.#maps.views[k].length;
+      first += maps;
+      return lampNumbers(light, first - maps, maps);
+    });
+    const thickness = this.#casters ? Math.min(this.thickness, THICKEST * this.#casters.radius) : 0, angle = this.rotation * Math.PI / 180;
+    const lit = this.#texture("lit", width, height, "rgba32float");
+    this.gpu.draw(this.#programs.deferred, {targets: [lit], textures: {sums0: sums[0], sums1: sums[1], sums2: sums[2], medians,
+      environment: t.environment, albedo: t.albedo, shadows: this.#textures.shadows ?? t.noMap},
+    uniforms: {...cameraNumbers(view, 0), turn: [Math.cos(angle), Math.sin(angle), 0, 0], levels: this.levels, lamps,
+      counts: [lights.length, this.background === "environment" && this.channel === "relit" ? 1 : 0, 0, 0],
+      maps: hasLamps ? this.#maps.views.flat().flatMap((each) => mapNumbers(each, thickness)) : []}});
+    return true;
+  }
+
+  /** Draw what is at hand now on the canvas. After `sorted`, draw again: the order of depth has been found. */
+  draw(camera) {
+    const isThere = this.shade(camera), {width, height} = camera, channel = CHANNELS.indexOf(this.channel), transform = TRANSFORMS.indexOf(this.viewTransform);
+    require(channel >= 0, `channel must be one of ${CHANNELS.join(", ")}`, this.channel);
+    require(transform >= 0, `viewTransform must be one of ${TRANSFORMS.join(", ")}`, this.viewTransform);
+    require(Number.isFinite(this.exposure) && Math.abs(this.exposure) <= 64, "exposure must be in [-64, 64] stops", this.exposure);
+    if (!isThere) return false;
+    const {canvas} = this, t = this.#textures, target = camera.target;
+    if (!target && (canvas.width !== width || canvas.height !== height)) Object.assign(canvas, {width, height});
+    const behind = Array.isArray(this.background) ? [...this.background, 1] : [0, 0, 0, 0];
+    this.gpu.draw(this.#programs.display, {textures: {lit: t.lit, sums0: t.sums0, sums1: t.sums1, sums2: t.sums2}, target,
+      uniforms: {image: [width, height, target?.x ?? 0, target?.y ?? 0], tone: [2 ** this.exposure, transform, channel, 0],
+        background: behind, range: this.depthRange ?? this.#depthRange(viewOf(camera))}});
+    return true;
+  }
+
+  #depthRange(view) {
+    const {center, radius} = this.#casters ?? {center: [0, 0, 0], radius: 1};
+    const middle = center.reduce((sum, value, k) => sum + (value - view.position[k]) * view.forward[k], 0);
+    return [Math.max(middle - radius, 0.01), middle + radius];
+  }
+
+  /** Resolves when the moment's segment is here, and all that was drawn last is in order. */
+  async ready() {
+    require(this.#take, "a take must be open", null);
+    await this.#load(this.#place().number);
+    if (this.#isLost || !this.#segments.has(this.#place().number)) return;
+    this.#advance();
+    for (const name of this.#views.keys()) await this.#sort(name, true);
+  }
+
+  /** Draw a moment as it is: its segment is fetched, and everything is in order of depth. True if it was drawn. */
+  async render(camera) {
+    this.shade(camera);
+    await this.ready();
+    return this.draw(camera);
+  }
+
+  /** Return the numbers of the last picture, RGBA a pixel, top row first: "lit" (radiance times alpha), "sums0" …. */
+  read(name = "lit") {
+    return this.gpu.read(this.#textures[name]);
+  }
+}
+
+const mapped = (object, change) => Object.fromEntries(Object.entries(object).map(([k, v]) => [k, change(v)]));
+
+/** Return the median over Gaussians of the middle one of three standard deviations [m]. */
+function middleScale(scales, count) {
+  if (!count) return 0;
+  const middles = new Float32Array(count);
+  for (let i = 0; i < count; i++) {
+    const a = scales[i], b = scales[count + i], c = scales[2 * count + i];
+    middles[i] = Math.max(Math.min(a, b), Math.min(Math.max(a, b), c));
+  }
+  middles.sort();
+  return 0.5 * (middles[(count - 1) >> 1] + middles[count >> 1]);
+}

@@ -1,0 +1,492 @@
+/**
+ * The passes of the renderer, in the dialect of gpu.js.
+ *
+ * Frames are evaluated into textures of Gaussians (evaluate), drawn back to front as splats (gbuffer), and lit pixel by
+ * pixel (deferred). Projection, cut-offs and depth are those of kernels/raster/{project,splat_rows}.py, which derive them.
+ * A median depth cannot be blended: it is found by a search over the order of splats (bins, pick, median).
+ */
+
+/** Gaussians in a row of the textures that hold them. */
+export const ROW = 1024;
+/** Most planes that a frame may be a sum of. */
+export const TERMS = 512;
+/** Most lamps, and most shadow maps of all lamps. */
+export const LAMPS = 16, MAPS = 24;
+/** Splats are divided into this many bins, and each bin into as many again, to find the median. */
+export const BINS = 16;
+
+/** Components of a Gaussian as the evaluation numbers them. */
+export const ORDER = {positions: 0, orientations: 3, turns: 6, scales: 9, opacities: 12, base_color: 13, roughness: 16};
+Object.assign(ORDER, {ambient_occlusion: 17, normals: 18});
+export const COMPONENTS = 21;
+
+const CELL = `
+ivec2 cellOf(int index) {
+  return ivec2(index % ${ROW}, index / ${ROW});
+}
+`;
+
+const EVALUATE = `${CELL}
+float component(int c, ivec2 cell) {
+  vec4 head = u.heads[c];
+  float value = head.x;
+  for (int k = int(head.y); k < int(head.y + head.z); k++) {
+    vec4 term = u.terms[k];
+    ivec2 place = ivec2(cell.x, cell.y + int(term.y));
+    int layer = int(term.z);
+    if (term.x < 0.5) {
+      value += term.w * fetchLayer(still, place, layer, 0).x;
+    } else if (term.x < 1.5) {
+      value += term.w * fetchLayer(summed, place, layer, 0).x;
+    } else {
+      value += term.w * float(fetchLayer(plain, place, layer, 0).x);
+    }
+  }
+  return value;
+}
+vec3 vectorAt(int c, ivec2 cell) {
+  return vec3(component(c, cell), component(c + 1, cell), component(c + 2, cell));
+}
+vec4 quaternionOf(vec3 parameters) {
+  float square = dot(parameters, parameters);
+  return vec4(2.0 * parameters, 1.0 - square) / (1.0 + square);
+}
+vec4 turnedBy(vec4 turn, vec4 q) {
+  return vec4(turn.w * q.xyz + q.w * turn.xyz + cross(turn.xyz, q.xyz), turn.w * q.w - dot(turn.xyz, q.xyz));
+}
+vec3 toWorld(vec3 v) {
+  return vec3(v.x, -v.z, v.y);
+}
+`;
+
+const EVALUATION = {
+  uniforms: [["heads", COMPONENTS], ["terms", TERMS]],
+  textures: [["still", "array"], ["summed", "array"], ["plain", "ints"]],
+};
+
+/** Writes centre and opacity, orientation, standard deviations and roughness; in the world, z up. */
+export const geometry = {
+  name: "geometry", ...EVALUATION, outputs: Array(3).fill("rgba32float"),
+  fragment: `${EVALUATE}
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
+  out0 = vec4(toWorld(vectorAt(${ORDER.positions}, cell)), clamp(component(${ORDER.opacities}, cell), 0.0, 1.0));
+  vec4 q = turnedBy(quaternionOf(vectorAt(${ORDER.turns}, cell)), quaternionOf(vectorAt(${ORDER.orientations}, cell)));
+  out1 = turnedBy(vec4(0.70710678, 0.0, 0.0, 0.70710678), q);
+  vec3 logarithms = vectorAt(${ORDER.scales}, cell);
+  out2 = vec4(exp(min(logarithms, vec3(20.0))) * step(vec3(-29.0), logarithms), clamp(component(${ORDER.roughness}, cell), 0.0, 1.0));
+}
+`,
+};
+
+/** Writes base colour and ambient occlusion, and the normal. */
+export const materials = {
+  name: "materials", ...EVALUATION, outputs: Array(2).fill("rgba32float"),
+  fragment: `${EVALUATE}
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
+  vec3 color = clamp(vectorAt(${ORDER.base_color}, cell), vec3(0.0), vec3(1.0));
+  out0 = vec4(color, clamp(component(${ORDER.ambient_occlusion}, cell), 0.0, 1.0));
+  vec3 normal = vectorAt(${ORDER.normals}, cell);
+  normal = normal / max(length(normal), 1.0e-12);
+  vec4 turn = quaternionOf(vectorAt(${ORDER.turns}, cell));
+  vec3 middle = 2.0 * cross(turn.xyz, normal);
+  out1 = vec4(toWorld(normal + turn.w * middle + cross(turn.xyz, middle)), 0.0);
+}
+`,
+};
+
+const LOG_CUT = "5.541263545158426";
+
+/** A Gaussian becomes a parallelogram around the ellipse where its alpha is 1/255; instances come back to front. */
+const SPLAT = (materialsToo) => `${CELL}
+void vertexMain() {
+  position = vec4(2.0, 2.0, 0.0, 1.0);
+  v0 = vec4(0.0);
+  v1 = vec4(0.0);
+  v2 = vec4(0.0);
+  ${materialsToo ? "v3 = vec4(0.0);\n  v4 = vec4(0.0);" : ""}
+  int rank = int(u.image.w) - 1 - instanceIndex;
+  int index = int(fetch(order, cellOf(rank), 0).x);
+  ivec2 cell = cellOf(index);
+  vec4 place = fetch(positions, cell, 0);
+  vec4 q = fetch(orientations, cell, 0);
+  vec4 sizes = fetch(scales, cell, 0);
+  vec3 s = sizes.xyz;
+  vec3 away = place.xyz - u.eye.xyz;
+  vec3 p = vec3(dot(u.right.xyz, away), dot(u.down.xyz, away), dot(u.forward.xyz, away));
+  float z = p.z;
+  if (!(z > u.filters.y) || !(dot(q, q) > 0.0)) {
+    return;
+  }
+  vec2 focal = u.lens.xy;
+  vec2 center = u.lens.zw;
+  vec2 tangent = p.xy / z;
+  vec2 margin = 0.15 * u.image.xy / focal;
+  vec2 j = clamp(tangent, -center / focal - margin, (u.image.xy - center) / focal + margin);
+  q = normalize(q);
+  vec3 columnX = vec3(1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + q.w * q.z), 2.0 * (q.x * q.z - q.w * q.y));
+  vec3 columnY = vec3(2.0 * (q.x * q.y - q.w * q.z), 1.0 - 2.0 * (q.x * q.x + q.z * q.z), 2.0 * (q.y * q.z + q.w * q.x));
+  vec3 columnZ = vec3(2.0 * (q.x * q.z + q.w * q.y), 2.0 * (q.y * q.z - q.w * q.x), 1.0 - 2.0 * (q.x * q.x + q.y * q.y));
+  vec3 right = vec3(dot(u.right.xyz, columnX), dot(u.right.xyz, columnY), dot(u.right.xyz, columnZ));
+  vec3 down = vec3(dot(u.down.xyz, columnX), dot(u.down.xyz, columnY), dot(u.down.xyz, columnZ));
+  vec3 forward = vec3(dot(u.forward.xyz, columnX), dot(u.forward.xyz, columnY), dot(u.forward.xyz, columnZ));
+  vec3 t0 = (focal.x / z) * (right * s - j.x * forward * s);
+  vec3 t1 = (focal.y / z) * (down * s - j.y * forward * s);
+  float sharpXx = dot(t0, t0);
+  float xy = dot(t0, t1);
+  float sharpYy = dot(t1, t1);
+  vec3 crossed = cross(t0, t1);
+  float sharpDet = dot(crossed, crossed);
+  float lowPass = u.filters.x;
+  float det = sharpDet + lowPass * (sharpXx + sharpYy) + lowPass * lowPass;
+  float xx = sharpXx + lowPass;
+  float kept = 1.0;
+  if (u.filters.z > 0.5) {
+    kept = sharpDet / det;
+  }
+  float opacity = place.w;
+  if (!(opacity * opacity * kept > 1.5378700499807768e-5) || !(det > 0.0)) {
+    return;
+  }
+  float logOpacity = log(opacity) + 0.5 * log(kept);
+  vec3 thick = max(s, vec3(1.0e-12));
+  vec3 inverse = min(thick.x, min(thick.y, thick.z)) / thick;
+  vec3 a = inverse * (right * tangent.x + down * tangent.y + forward);
+  vec3 b0 = inverse * right / focal.x;
+  vec3 b1 = inverse * down / focal.y;
+  float aa = dot(a, a);
+  vec2 middle = focal * tangent + center;
+  v0 = vec4(middle, logOpacity, z);
+  v1 = vec4(inversesqrt(xx), xy / xx, sqrt(xx / det), 3.0 * max(s.x, max(s.y, s.z)));
+  v2 = vec4(dot(a, b0) / aa, dot(a, b1) / aa, float(rank), sizes.w);
+  ${materialsToo ? "v3 = fetch(colors, cell, 0);\n  v4 = fetch(normals, cell, 0);" : ""}
+  float reach = sqrt(2.0 * (${LOG_CUT} + logOpacity)) * 1.0001 + 1.0e-3;
+  vec2 e = reach * vec2(float(vertexIndex % 2) * 2.0 - 1.0, float(vertexIndex / 2) * 2.0 - 1.0);
+  float dx = e.x / v1.x;
+  vec2 corner = middle + vec2(dx, e.y / v1.z + v1.y * dx);
+  position = vec4(2.0 * corner / u.image.xy - 1.0, 0.0, 1.0);
+}
+`;
+
+/** Alpha of a splat at the pixel, 0 below the cut; its depth there: that of the tangent plane of its largest response. */
+const SEEN = `
+float alphaHere() {
+  vec2 offset = pixel - v0.xy;
+  vec2 e = vec2(offset.x * v1.x, (offset.y - v1.y * offset.x) * v1.z);
+  float logAlpha = v0.z - 0.5 * dot(e, e);
+  float alpha = 0.0;
+  if (logAlpha >= -${LOG_CUT}) {
+    alpha = min(exp(logAlpha), 0.99);
+  }
+  return alpha;
+}
+float depthHere() {
+  float facing = 1.0 + dot(v2.xy, pixel - v0.xy);
+  float far = v0.w + v1.w;
+  float depth = far;
+  if (facing > 0.0) {
+    depth = min(v0.w / facing, far);
+  }
+  return max(depth, max(v0.w - v1.w, u.filters.y));
+}
+`;
+
+const VIEW = ["right", "down", "forward", "eye", "lens", "image", "filters"].map((name) => [name]);
+const CLOUD = ["order", "positions", "orientations", "scales"].map((name) => [name, "float2d"]);
+
+/** Sums of materials and depth: colour; normal; roughness, occlusion, depth; alpha in each. */
+export const gbuffer = (format) => ({
+  name: "gbuffer", uniforms: VIEW, textures: [...CLOUD, ["colors", "float2d"], ["normals", "float2d"]], varyings: 5,
+  outputs: Array(3).fill(format), blend: "over", vertex: SPLAT(true),
+  fragment: `${SEEN}
+void fragmentMain() {
+  float alpha = alphaHere();
+  if (alpha <= 0.0) {
+    discard;
+  }
+  out0 = vec4(v3.xyz * alpha, alpha);
+  out1 = vec4(v4.xyz * alpha, alpha);
+  out2 = vec4(vec3(v2.w, v3.w, depthHere()) * alpha, alpha);
+}
+`,
+});
+
+/** Sums of depth and alpha alone, for shadow maps. */
+export const depths = (format) => ({
+  name: "depths", uniforms: VIEW, textures: CLOUD, varyings: 3, outputs: [format], blend: "over", vertex: SPLAT(false),
+  fragment: `${SEEN}
+void fragmentMain() {
+  float alpha = alphaHere();
+  if (alpha <= 0.0) {
+    discard;
+  }
+  out0 = vec4(0.0, 0.0, depthHere() * alpha, alpha);
+}
+`,
+});
+
+const RANK = `
+int rankHere() {
+  return int(v2.z + 0.5);
+}
+vec4 through(int bin, int first, float share) {
+  vec4 found = vec4(1.0);
+  for (int k = 0; k < 4; k++) {
+    if (first + k == bin) {
+      found[k] = share;
+    }
+  }
+  return found;
+}
+`;
+
+/** What passes each bin of splats, a product that needs no order; `fine` looks into the bin that was picked. */
+export const bins = (fine) => ({
+  name: fine ? "fine bins" : "bins", uniforms: [...VIEW, ["sizes"]], textures: [...CLOUD, ...(fine ? [["picked", "float2d"]] : [])],
+  varyings: 3, outputs: Array(4).fill("rgba16float"), blend: "times", vertex: SPLAT(false),
+  fragment: `${SEEN}${RANK}
+void fragmentMain() {
+  float alpha = alphaHere();
+  int coarse = rankHere() / int(u.sizes.x);
+  int bin = coarse;
+  ${fine ? `bin = (rankHere() - coarse * int(u.sizes.x)) / int(u.sizes.y);
+  if (coarse != int(fetch(picked, ivec2(pixel), 0).x)) {
+    discard;
+  }` : ""}
+  if (alpha <= 0.0) {
+    discard;
+  }
+  out0 = through(bin, 0, 1.0 - alpha);
+  out1 = through(bin, 4, 1.0 - alpha);
+  out2 = through(bin, 8, 1.0 - alpha);
+  out3 = through(bin, 12, 1.0 - alpha);
+}
+`,
+});
+
+/** The last bin with something in it before which more than half of the light passes: coarse, fine, what passes before. */
+export const pick = (fine) => ({
+  name: "pick", textures: [["bins0", "float2d"], ["bins1", "float2d"], ["bins2", "float2d"], ["bins3", "float2d"],
+    ...(fine ? [["picked", "float2d"]] : [])], outputs: ["rgba32float"],
+  fragment: `
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
+  vec4 shares = vec4(1.0);
+  float passes = 1.0;
+  float coarse = -1.0;
+  ${fine ? "coarse = fetch(picked, cell, 0).x;\n  passes = fetch(picked, cell, 0).z;" : ""}
+  vec4 found = vec4(coarse, -1.0, passes, 1.0);
+  for (int bin = 0; bin < ${BINS}; bin++) {
+    if (bin == 0) {
+      shares = fetch(bins0, cell, 0);
+    }
+    if (bin == 4) {
+      shares = fetch(bins1, cell, 0);
+    }
+    if (bin == 8) {
+      shares = fetch(bins2, cell, 0);
+    }
+    if (bin == 12) {
+      shares = fetch(bins3, cell, 0);
+    }
+    float share = shares[bin % 4];
+    if (passes > 0.5 && share < 1.0) {
+      found = vec4(${fine ? "coarse, float(bin)" : "float(bin), -1.0"}, passes, 1.0);
+    }
+    passes = passes * share;
+  }
+  out0 = found;
+}
+`,
+});
+
+/** Depth of the picked bin's splats, which are few: sums weighted by alpha. */
+export const median = (format) => ({
+  name: "median", uniforms: [...VIEW, ["sizes"]], textures: [...CLOUD, ["picked", "float2d"]], varyings: 3, outputs: [format],
+  blend: "plus", vertex: SPLAT(false),
+  fragment: `${SEEN}${RANK}
+void fragmentMain() {
+  float alpha = alphaHere();
+  vec4 found = fetch(picked, ivec2(pixel), 0);
+  int coarse = rankHere() / int(u.sizes.x);
+  int bin = (rankHere() - coarse * int(u.sizes.x)) / int(u.sizes.y);
+  if (alpha <= 0.0 || coarse != int(found.x) || bin != int(found.y)) {
+    discard;
+  }
+  out0 = vec4(depthHere() * alpha, alpha, 0.0, 0.0);
+}
+`,
+});
+
+/** A shadow map's texel: alpha, median depth, mean depth, depth of meshes. */
+export const texels = {
+  name: "texels", textures: [["sums", "float2d"], ["medians", "float2d"], ["meshes", "float2d"]], outputs: ["rgba32float"],
+  fragment: `
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
+  vec4 seen = fetch(sums, cell, 0);
+  vec4 middle = fetch(medians, cell, 0);
+  float behind = fetch(meshes, ivec2(0, 0), 0).x;
+  out0 = vec4(min(seen.w, 1.0), middle.x / max(middle.y, 1.0e-12), seen.z / max(seen.w, 1.0e-12), behind);
+}
+`,
+};
+
+/** What the functions of engines/shading fetch. */
+const HOOKS = `
+ShadowView shadowView(int map) {
+  ShadowView view;
+  vec4 a = u.maps[map * 5];
+  vec4 b = u.maps[map * 5 + 1];
+  vec4 c = u.maps[map * 5 + 2];
+  vec4 d = u.maps[map * 5 + 3];
+  vec4 e = u.maps[map * 5 + 4];
+  view.right = a.xyz;
+  view.down = b.xyz;
+  view.forward = c.xyz;
+  view.position = d.xyz;
+  view.focal = e.xy;
+  view.center = e.zw;
+  view.size = 2.0 * e.zw;
+  view.radius = a.w;
+  view.front = b.w;
+  view.thickness = c.w;
+  view.largestKernel = d.w;
+  return view;
+}
+vec4 shadowTexel(int map, ivec2 cell) {
+  return fetchLayer(shadows, cell, map, 0);
+}
+int environmentRows(int level) {
+  return int(u.levels[level + 1].x);
+}
+vec3 environmentTexel(int level, ivec2 cell) {
+  return fetch(environment, ivec2(cell.x, cell.y + int(u.levels[level + 1].y)), 0).xyz;
+}
+vec2 albedoTexel(ivec2 cell) {
+  return fetch(albedo, cell, 0).xy;
+}
+`;
+
+const CAMERA = [["right"], ["down"], ["forward"], ["eye"], ["lens"], ["image"]];
+
+/** Radiance multiplied by alpha, and alpha; the texture has the rows of the image, top first. */
+export const deferred = (shading) => ({
+  name: "deferred",
+  uniforms: [...CAMERA, ["turn"], ["counts"], ["levels", 14], ["lamps", 4 * LAMPS], ["maps", 5 * MAPS]],
+  textures: [["sums0", "float2d"], ["sums1", "float2d"], ["sums2", "float2d"], ["medians", "float2d"], ["environment", "float2d"],
+    ["albedo", "float2d"], ["shadows", "array"]],
+  outputs: ["rgba32float"], shading,
+  fragment: `#shading
+${HOOKS}
+Lamp lampAt(int k) {
+  Lamp lamp;
+  vec4 a = u.lamps[4 * k];
+  vec4 b = u.lamps[4 * k + 1];
+  vec4 c = u.lamps[4 * k + 2];
+  vec4 d = u.lamps[4 * k + 3];
+  lamp.position = a.xyz;
+  lamp.direction = b.xyz;
+  lamp.power = c.xyz;
+  lamp.cone = d.xy;
+  lamp.size = b.w;
+  lamp.kind = int(a.w);
+  lamp.firstMap = int(d.z);
+  lamp.mapCount = int(d.w);
+  return lamp;
+}
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
+  vec4 color = fetch(sums0, cell, 0);
+  vec4 rest = fetch(sums2, cell, 0);
+  vec3 normal = fetch(sums1, cell, 0).xyz;
+  float alpha = color.w;
+  out0 = vec4(0.0);
+  if (alpha > 0.0) {
+    vec3 ray = pixelRay(pixel, u.lens.xy, u.lens.zw, u.right.xyz, u.down.xyz, u.forward.xyz);
+    float depth = rest.z / alpha;
+    if (u.counts.x > 0.5) {
+      vec4 middle = fetch(medians, cell, 0);
+      depth = min(depth, middle.x / max(middle.y, 1.0e-12));
+    }
+    Surface surface = surfaceOfSums(color.xyz, rest.x, rest.y, normal, alpha, u.eye.xyz, ray, depth);
+    vec3 radiance = environmentRadiance(surface, u.turn.xy);
+    vec2 turn = randomTurn(uint(cell.y) * uint(u.image.x) + uint(cell.x));
+    for (int k = 0; k < int(u.counts.x); k++) {
+      radiance += lampRadiance(surface, lampAt(k), turn);
+    }
+    float coverage = min(alpha, 1.0);
+    out0 = vec4(radiance * coverage, coverage);
+  }
+  if (u.counts.y > 0.5) {
+    vec3 ray = pixelRay(pixel, u.lens.xy, u.lens.zw, u.right.xyz, u.down.xyz, u.forward.xyz);
+    out0 = vec4(out0.xyz + (1.0 - out0.w) * levelRadiance(0, unturned(normalize(ray), u.turn.xy)), 1.0);
+  }
+}
+`,
+});
+
+/** Names of what can be shown, in the order of their numbers. */
+export const CHANNELS = ["relit", "base_color", "roughness", "ambient_occlusion", "normals", "depth", "alpha"];
+
+/** The picture on the canvas: exposure, view transform, background; or a channel of the G-buffer. */
+export const display = (shading, flip) => ({
+  name: "display",
+  uniforms: [["image"], ["tone"], ["background"], ["range"]],
+  textures: [["lit", "float2d"], ["sums0", "float2d"], ["sums1", "float2d"], ["sums2", "float2d"]], shading,
+  fragment: `#shading
+vec3 channelColor(int channel, ivec2 cell, float alpha) {
+  vec4 rest = fetch(sums2, cell, 0);
+  vec3 normal = fetch(sums1, cell, 0).xyz;
+  vec3 color = linearToSrgb(clamp(fetch(sums0, cell, 0).xyz / alpha, vec3(0.0), vec3(1.0)));
+  if (channel == 2) {
+    color = vec3(rest.x / alpha);
+  }
+  if (channel == 3) {
+    color = vec3(rest.y / alpha);
+  }
+  if (channel == 4) {
+    color = 0.5 + 0.5 * normal / max(length(normal), 1.0e-12);
+  }
+  if (channel == 5) {
+    color = vec3(clamp((u.range.y - rest.z / alpha) / max(u.range.y - u.range.x, 1.0e-6), 0.0, 1.0));
+  }
+  if (channel == 6) {
+    color = vec3(1.0);
+  }
+  return color;
+}
+void fragmentMain() {
+  vec2 place = pixel - u.image.zw;
+  ${flip ? "place.y = u.image.y - place.y;" : ""}
+  ivec2 cell = ivec2(place);
+  vec4 shown = fetch(lit, cell, 0);
+  int channel = int(u.tone.z);
+  int mode = int(u.background.w);
+  float alpha = shown.w;
+  vec3 color = vec3(0.0);
+  if (channel > 0) {
+    if (alpha > 0.0) {
+      color = channelColor(channel, cell, alpha);
+    }
+    float floorOf = 0.0;
+    if (mode > 0) {
+      floorOf = 1.0;
+    }
+    out0 = vec4(color * alpha + u.background.xyz * ((1.0 - alpha) * floorOf), max(alpha, floorOf));
+  } else {
+    if (alpha > 0.0) {
+      color = displayLinear(shown.xyz / alpha, u.tone.x, int(u.tone.y));
+    }
+    if (mode == 1) {
+      vec3 behind = pow((u.background.xyz + 0.055) / 1.055, vec3(2.4));
+      behind = mix(behind, u.background.xyz / 12.92, step(u.background.xyz, vec3(0.04045)));
+      out0 = vec4(linearToSrgb(alpha * color + (1.0 - alpha) * behind), 1.0);
+    } else {
+      out0 = vec4(linearToSrgb(color) * alpha, alpha);
+    }
+  }
+}
+`,
+});
