@@ -60,7 +60,7 @@ const numbered = (count, line) => Array.from({length: count}, (_, k) => line(k))
 /** WebGL2 with float targets. */
 export class WebGL2 {
   static create(canvas, context) {
-    const gl = context ?? canvas.getContext("webgl2", {alpha: true, premultipliedAlpha: true, antialias: false});
+    const gl = context ?? (canvas ?? new OffscreenCanvas(1, 1)).getContext("webgl2", {alpha: true, premultipliedAlpha: true, antialias: false});
     if (!gl) throw new GpuError("this browser must offer WebGL2, got none. Update it, or turn on graphics acceleration.");
     const missing = ["EXT_color_buffer_float", "EXT_float_blend"].filter((name) => !gl.getExtension(name));
     if (missing.includes("EXT_color_buffer_float")) {
@@ -73,7 +73,7 @@ export class WebGL2 {
   texture({width, height, layers = 0, format}) {
     const gl = this.gl, target = layers ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D, handle = gl.createTexture();
     gl.bindTexture(target, handle);
-    const inner = {rgba32float: gl.RGBA32F, rgba16float: gl.RGBA16F, r32float: gl.R32F, r8sint: gl.R8I}[format];
+    const inner = {rgba8unorm: gl.RGBA8, rgba32float: gl.RGBA32F, rgba16float: gl.RGBA16F, r32float: gl.R32F, r8sint: gl.R8I}[format];
     if (layers) gl.texStorage3D(target, 1, inner, width, height, layers);
     else gl.texStorage2D(target, 1, inner, width, height);
     for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(target, gl[`TEXTURE_${name}`], gl.NEAREST);
@@ -147,7 +147,7 @@ void main() { pixel = gl_FragCoord.xy; fragmentMain(); }`],
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, null, 0);
     }
     if (pairs.length) gl.drawBuffers(pairs.map((_, k) => gl.COLOR_ATTACHMENT0 + k));
-    const {width, height, x = 0, y = 0} = pairs[0]?.[0] ?? target ?? this.canvas;
+    const {width, height, x = 0, y = 0} = pairs[0]?.[0] ?? target ?? this.gl.canvas;
     gl.viewport(x, y, width, height);
     for (const name of ["DEPTH_TEST", "STENCIL_TEST", "CULL_FACE", "SCISSOR_TEST", "BLEND", "DITHER"]) gl.disable(gl[name]);
     gl.colorMask(true, true, true, true);
@@ -175,20 +175,21 @@ void main() { pixel = gl_FragCoord.xy; fragmentMain(); }`],
     gl.bindVertexArray(null);
   }
 
-  /** Return a texture's RGBA numbers, row by row from the first. */
+  /** Return a texture's RGBA numbers, row by row from the first: floats, or bytes of an 8-bit one. */
   async read(texture, layer = 0) {
-    const gl = this.gl, {width, height} = texture, content = new Float32Array(4 * width * height);
+    const gl = this.gl, {width, height} = texture, isBytes = texture.format === "rgba8unorm";
+    const content = new (isBytes ? Uint8Array : Float32Array)(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffers[1]);
     if (texture.layers) gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, texture.handle, 0, layer);
     else gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture.handle, 0);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, content);
+    gl.readPixels(0, 0, width, height, gl.RGBA, isBytes ? gl.UNSIGNED_BYTE : gl.FLOAT, content);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     return content;
   }
 
   onLost(call) {
     this.watch = (event) => { event.preventDefault(); call("the WebGL context was lost"); };
-    this.canvas.addEventListener("webglcontextlost", this.watch);
+    this.gl.canvas.addEventListener("webglcontextlost", this.watch);
   }
 
   get maxTextureSide() {
@@ -196,7 +197,7 @@ void main() { pixel = gl_FragCoord.xy; fragmentMain(); }`],
   }
 
   dispose() {
-    this.canvas.removeEventListener("webglcontextlost", this.watch);
+    this.gl.canvas.removeEventListener("webglcontextlost", this.watch);
     for (const texture of [...this.made]) this.destroy(texture);
     for (const framebuffer of this.framebuffers) this.gl.deleteFramebuffer(framebuffer);
     this.gl.deleteVertexArray(this.vertices);
@@ -221,7 +222,7 @@ export class WebGPU {
       blendFormat: features.has("float32-blendable") ? "rgba32float" : "rgba16float"});
     gpu.context = canvas?.getContext("webgpu");
     if (canvas && !gpu.context) throw new GpuError("the canvas must be free for WebGPU, got one with another context. Make a new one.");
-    gpu.format = navigator.gpu.getPreferredCanvasFormat();
+    gpu.format = canvas ? navigator.gpu.getPreferredCanvasFormat() : "rgba8unorm";
     gpu.context?.configure({device, format: gpu.format, alphaMode: "premultiplied"});
     return gpu;
   }
@@ -301,14 +302,15 @@ return Outputs(${outputs.map((_, k) => `out${k}`).join(", ")}); }`];
   }
 
   async read(texture, layer = 0) {
-    const {width, height} = texture, stride = Math.ceil(width / 16) * 256;
+    const {width, height} = texture, isBytes = texture.format === "rgba8unorm", stride = Math.ceil(width * (isBytes ? 4 : 16) / 256) * 256;
     const buffer = this.device.createBuffer({size: stride * height, usage: GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ});
     const encoder = this.device.createCommandEncoder();
     encoder.copyTextureToBuffer({texture: texture.handle, origin: [0, 0, layer]}, {buffer, bytesPerRow: stride}, [width, height, 1]);
     this.device.queue.submit([encoder.finish()]);
     await buffer.mapAsync(GPUMapMode.READ);
-    const from = new Float32Array(buffer.getMappedRange()), content = new Float32Array(4 * width * height);
-    for (let y = 0; y < height; y++) content.set(from.subarray(y * stride / 4, y * stride / 4 + 4 * width), 4 * width * y);
+    const Numbers = isBytes ? Uint8Array : Float32Array, from = new Numbers(buffer.getMappedRange()), content = new Numbers(4 * width * height);
+    const step = stride / Numbers.BYTES_PER_ELEMENT;
+    for (let y = 0; y < height; y++) content.set(from.subarray(y * step, y * step + 4 * width), 4 * width * y);
     buffer.destroy();
     return content;
   }

@@ -56,7 +56,7 @@ export class Relight extends EventTarget {
 
   /**
    * Return a renderer.
-   * @param {HTMLCanvasElement|OffscreenCanvas} canvas What is drawn on.
+   * @param {HTMLCanvasElement|OffscreenCanvas|null} canvas What is drawn on; null to draw pictures that `read` returns.
    * @param {{backend?: "webgpu"|"webgl2", context?: WebGL2RenderingContext, device?: GPUDevice, shadowMapSize?: number}} [options]
    *     By default WebGPU if there is any; a context or a device of another renderer, to share textures with it.
    */
@@ -86,7 +86,7 @@ export class Relight extends EventTarget {
     const {blendFormat: format} = this.gpu, program = (spec) => this.gpu.program(spec);
     this.#programs = {
       geometry: program(passes.geometry), materials: program(passes.materials), gbuffer: program(passes.gbuffer(format)),
-      deferred: program(passes.deferred({glsl: GLSL + GLSL_FETCHING, wgsl: WGSL + WGSL_FETCHING})), display: program(passes.display({glsl: GLSL, wgsl: WGSL}, this.backend === "webgl2")),
+      deferred: program(passes.deferred({glsl: GLSL + GLSL_FETCHING, wgsl: WGSL + WGSL_FETCHING})), display: program(passes.display({glsl: GLSL, wgsl: WGSL}, this.backend === "webgl2" && !!this.canvas)),
     };
     this.#textures = {nothing: this.#filled([FAR_AWAY, 0, 0, 0]), noMap: this.gpu.texture({width: 1, height: 1, layers: 1, format: "rgba32float"})};
     this.#upload(this.#environment);
@@ -139,7 +139,7 @@ export class Relight extends EventTarget {
       }
     };
     if (this.backend === "webgpu") again();
-    else this.canvas.addEventListener("webglcontextrestored", again, {once: true});
+    else this.gpu.gl.canvas.addEventListener("webglcontextrestored", again, {once: true});
   }
 
   /** Give back all memory; the renderer cannot be used any more. */
@@ -501,9 +501,10 @@ export class Relight extends EventTarget {
     require(Number.isFinite(this.exposure) && Math.abs(this.exposure) <= 64, "exposure must be in [-64, 64] stops", this.exposure);
     if (!isThere) return false;
     const {canvas} = this, t = this.#textures, target = camera.target;
-    if (!target && (canvas.width !== width || canvas.height !== height)) Object.assign(canvas, {width, height});
+    if (canvas && !target && (canvas.width !== width || canvas.height !== height)) Object.assign(canvas, {width, height});
+    const targets = canvas || target ? [] : [this.#texture("picture", width, height, "rgba8unorm")];
     const behind = Array.isArray(this.background) ? [...this.background, 1] : [0, 0, 0, 0];
-    this.gpu.draw(this.#programs.display, {textures: {lit: t.lit, sums0: t.sums0, sums1: t.sums1, sums2: t.sums2}, target,
+    this.gpu.draw(this.#programs.display, {textures: {lit: t.lit, sums0: t.sums0, sums1: t.sums1, sums2: t.sums2}, target, targets,
       uniforms: {image: [width, height, target?.x ?? 0, target?.y ?? 0], tone: [2 ** this.exposure, transform, channel, 0],
         background: behind, range: this.depthRange ?? this.#depthRange(viewOf(camera))}});
     return true;
@@ -531,7 +532,10 @@ export class Relight extends EventTarget {
     return this.draw(camera);
   }
 
-  /** Return the numbers of the last picture, RGBA a pixel, top row first: "lit" (radiance times alpha), "sums0" …. */
+  /**
+   * Return what was drawn last, RGBA a pixel, top row first: "lit", floats (radiance times alpha, and alpha); "picture",
+   * bytes for a display, of a renderer without a canvas; "sums0" … "sums2" and "medians", the G-buffer.
+   */
   read(name = "lit") {
     return this.gpu.read(this.#textures[name]);
   }

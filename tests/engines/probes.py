@@ -5,11 +5,11 @@ kept in files: a case takes about a second. Environment shadows and bounces are 
 ambient occlusion and specular occlusion stand for them.
 
     for golden in goldens(["tripod"], ["studio", "spot"]):
-        golden.shot.cloud, golden.shot.camera, golden.shot.environment, golden.shot.environment_rotation, golden.shot.lights
-        golden.image.rgb, golden.image.alpha   # truth: scene-linear, multiplied by alpha
-        golden.buffer                          # what was blended, before light: for engines that only shade
-        prefiltered(golden.shot.environment)   # irradiance, then 13 levels, (rows, 2 rows, 3) each
-        shadow_maps(golden)                    # views and texels of all lamps, one after the other
+        golden.shot                           # cloud, camera, environment and its rotation, lights
+        golden.image.rgb, golden.image.alpha  # truth: scene-linear, multiplied by alpha
+        golden.buffer                         # what was blended, before light: for engines that only shade
+        prefiltered(golden.shot.environment)  # irradiance, then 13 levels, (rows, 2 rows, 3) each
+        shadow_maps(golden)                   # views and texels of all lamps, one after the other
 """
 
 from __future__ import annotations
@@ -119,7 +119,13 @@ def _materials(
 
 
 PROBES = {"tripod": tripod, "spheres": spheres, "corner": corner, "figure": figure}
-EYES = {"tripod": probe.EYE, "spheres": (0.5, -2.0, 0.6), "corner": (2.0, 1.8, 1.4), "figure": (1.3, -2.6, 1.5)}
+EYES = {
+    "tripod": (0.65, -1.4, 0.95),
+    "spheres": (0.5, -2.0, 0.6),
+    "corner": (2.0, 1.8, 1.4),
+    "figure": (1.3, -2.6, 1.5),
+}
+FIELDS = {"tripod": 45.0, "spheres": 34.0, "corner": 45.0, "figure": 38.0}
 TARGETS = {"tripod": probe.TARGET, "spheres": (0, 0, 0), "corner": (0.35, 0.35, 0.35), "figure": None}
 ENVIRONMENTS = ("studio", "sunset", "stage")
 LAMPS = ("point", "spot", "sun")
@@ -204,7 +210,7 @@ def goldens(probes: Sequence[str] = tuple(PROBES), lightings: Sequence[str] = LI
         points = cloud.positions.astype(np.float64)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         target = middle if TARGETS[name] is None else TARGETS[name]
-        camera = Camera.look_at(EYES[name], target, width=SIDE, height=SIDE, vertical_fov=45.0)
+        camera = Camera.look_at(EYES[name], target, width=SIDE, height=SIDE, vertical_fov=FIELDS[name])
         size = float(np.linalg.norm(points - middle, axis=1).max())
         for lighting in lightings:
             shot = Shot(
