@@ -38,8 +38,8 @@ export async function start(root, settings) {
 export class Player {
   constructor(root, settings) {
     const {view = {}} = settings;
-    Object.assign(this, {root, settings, scale: 0, lastMove: 0, environments: new Map()});
-    this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: null, rotation: 0, exposure: 0,
+    Object.assign(this, {root, settings, shadows: SHADOWS, scale: 0, lastMove: 0, environments: new Map()});
+    this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: null, rotation: 0, exposure: 0, behind: false,
       transform: "standard", background: "#212121", path: Boolean(view.cameras), ...view.state};
     this.canvas = element("canvas", {tabIndex: 0, ariaLabel: "The take. Drag or use the arrow keys to orbit."});
     this.overlay = document.createElementNS("http://www.w3.org/2000/svg", "svg");
@@ -125,7 +125,7 @@ export class Player {
     if ("time" in values || "playing" in values) this.showTime();
     if ("background" in values) this.root.style.setProperty("--behind", state.background);
     if (relight) Object.assign(relight, {rotation: this.rotation, exposure: state.exposure, viewTransform: state.transform,
-      channel: state.channel});
+      channel: state.channel, background: state.behind ? "environment" : null});
     this.wake();
   }
 
@@ -172,7 +172,7 @@ export class Player {
     [this.lastTick, this.isChanged] = [rest < STILL ? now : null, false];
     if (isDue || step !== this.drawn) {
       this.isDrawing = true;
-      this.draw(SCALES[step], SHADOWS[step]);
+      this.draw(SCALES[step], this.shadows[step]);
       const milliseconds = await finished(this.relight.gpu);
       this.isDrawing = false;
       if (step === this.scale && isDue) this.adapt(milliseconds);
@@ -196,7 +196,7 @@ export class Player {
     if (scale !== this.scale && now() - (this.lastStep ?? 0) > 500) [this.scale, this.lastStep, this.pace] = [scale, now(), null];
   }
 
-  draw(scale = 1, shadows = SHADOWS[0]) {
+  draw(scale = 1, shadows = this.shadows[0]) {
     const size = scale * Math.min(devicePixelRatio || 1, 2), width = Math.round(this.root.clientWidth * size);
     const height = Math.round(this.root.clientHeight * size);
     if (!width || !height) return;
@@ -284,7 +284,7 @@ export class Player {
       group("Picture", true, this.channel = this.select("Channel", "channel", CHANNELS), this.color("Background", "background"),
         this.settings.view?.cameras ? this.check("Camera path", "path") : "",
         element("button", {className: "word", textContent: "Frame subject", onclick: () => this.frameSubject()})),
-      group("Light", true, this.environmentSelect(), this.range("Rotation", "rotation", -180, 180, 1, "°"),
+      group("Light", true, this.environmentSelect(), this.check("Show it behind", "behind"), this.range("Rotation", "rotation", -180, 180, 1, "°"),
         this.range("Exposure", "exposure", -6, 6, 0.1, " stops"), this.select("View transform", "transform", TRANSFORMS)),
       group("Lamps", true, element("div", {className: "row"}, kind, add), this.lamps.list),
       group("Files", false, element("div", {className: "row"}, element("button", {className: "word", textContent: "Save PNG", onclick: () => this.savePng()}),
@@ -312,9 +312,9 @@ export class Player {
   }
 
   range(label, name, min, max, step, unit) {
-    const value = element("output"), made = element("input", {type: "range", min, max, step, oninput: () => this.change({[name]: Number(made.value)}),
+    const value = element("b", {ariaHidden: "true"}), made = element("input", {type: "range", min, max, step, oninput: () => this.change({[name]: Number(made.value)}),
       ondblclick: () => this.change({[name]: 0})});
-    this.shown[name] = (number) => { made.value = number; value.textContent = `${number}${unit}`; };
+    this.shown[name] = (number) => { made.value = number; made.ariaValueText = value.textContent = `${number}${unit}`; };
     this.shown[name](this.state[name]);
     return element("label", {}, element("span", {}, label, value), made);
   }

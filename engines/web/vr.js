@@ -66,6 +66,7 @@ class Headset {
   }
 
   drawEye(view, port) {
+    if (!port.width || !port.height) return; // a headset of one eye
     const target = {framebuffer: this.layer.framebuffer, x: port.x, y: port.y, width: port.width, height: port.height};
     this.relight.draw({...eye(view, port.width, port.height, this), name: view.eye, target});
   }
