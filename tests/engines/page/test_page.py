@@ -82,7 +82,7 @@ def test_every_module_is_there_and_found_by_name(take, tmp_path):
     publish(take, tmp_path / "page.html")
     imports = json.loads(page_of(tmp_path / "page.html")[0].texts["importmap"])["imports"]
     texts = {name: base64.b64decode(address.partition(",")[2]).decode() for name, address in imports.items()}
-    wanted = [re.findall(r"""(?:from|import)\s*\(?\s*["']([^"']+)["']""", text) for text in texts.values()]
+    wanted = [re.findall(r'^import .*?"([^"]+)";', text, re.MULTILINE) for text in texts.values()]
     assert {name for names in wanted for name in names} <= set(texts)
     assert {f"{MODULES}/{name}" for name in ("player.js", "b4d.js", "relight.js")} <= set(texts)
     assert set(modules()) == {name.removeprefix(f"{MODULES}/") for name in texts}
