@@ -31,7 +31,7 @@ _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data: blob:; style-src 'unsafe-inline'; img-src data: blob:; "
     "connect-src 'self' data: blob:; worker-src data: blob:"
 )
-_OLD = "This page needs JavaScript, and a browser of 2023 or later."
+_OLD = "This page needs JavaScript, and a browser of 2024 or later."
 
 
 def write_player(

@@ -25,7 +25,7 @@ export function fromLight(light, {center, extent}) {
   const reach = Math.max(length(add(center, place, -1)), 0.1 * extent);
   const target = light.direction ? add(place, light.direction, reach / length(light.direction)) : [...center];
   return {kind: light.type, position: [...place], target, color: hexOf(given.map((v) => v / power)), power, cone: light.outer_angle ?? 30,
-    core: light.inner_angle / light.outer_angle || SPOT_CORE, size: (isSun ? light.angular_diameter ?? 0.53 : light.radius ?? 0), shadows: light.casts_shadows ?? true};
+    core: (light.inner_angle ?? 20) / (light.outer_angle ?? 30), size: (isSun ? light.angular_diameter ?? 0.53 : light.radius ?? 0), shadows: light.casts_shadows ?? true};
 }
 
 /** Return a lamp as `beam render --lights` and the core read it. */

@@ -31,8 +31,6 @@ export class Orbit {
     canvas.addEventListener("keydown", (event) => this.key(event));
   }
 
-  get isHeld() { return this.fingers.size > 0 || this.isKeyed; }
-
   /** Look at a box from the front, so that it fills what is free of the page. */
   frame(box, {width, height}) {
     Object.assign(this, {azimuth: 0, elevation: ELEVATION, target: box.center, isFramed: true});
@@ -44,7 +42,14 @@ export class Orbit {
       distance = Math.max(distance, across - dot(place, forward));
     }
     Object.assign(this, {distance, size: box.extent});
-    this.moved();
+    this.moved(false);
+  }
+
+  /** Go on from where a camera of a path looks from. */
+  adopt({position, worldToCamera}) {
+    const forward = worldToCamera.slice(6), distance = Math.max(dot(add(this.target, position, -1), forward), 0.1);
+    Object.assign(this, {azimuth: Math.atan2(-forward[0], forward[1]), elevation: Math.asin(Math.max(-1, Math.min(1, -forward[2]))), distance,
+      target: add(position, forward, distance)});
   }
 
   axes() {
@@ -91,28 +96,28 @@ export class Orbit {
       ArrowDown: () => this.turn(0, -step), "+": () => this.zoom(0.9), "=": () => this.zoom(0.9), "-": () => this.zoom(1 / 0.9)};
     if (!(event.key in moves)) return;
     event.preventDefault();
-    this.isKeyed = true;
     moves[event.key]();
-    this.isKeyed = false;
   }
 
   turn(azimuth, elevation) {
-    this.isFramed = false;
     this.azimuth += azimuth;
     this.elevation = Math.max(-STEEPEST, Math.min(STEEPEST, this.elevation + elevation));
-    this.moved();
+    this.byHand();
   }
 
   pan(x, y) {
     const {right, down} = this.axes(), share = 2 * this.distance * Math.tan(0.5 * FIELD_OF_VIEW) / this.canvas.clientHeight;
-    this.isFramed = false;
     this.target = add(add(this.target, right, -share * x), down, -share * y);
-    this.moved();
+    this.byHand();
   }
 
   zoom(factor) {
-    this.isFramed = false;
     this.distance = Math.max(0.02 * (this.size ?? 1), Math.min(50 * (this.size ?? 1), this.distance * factor));
-    this.moved();
+    this.byHand();
+  }
+
+  byHand() {
+    this.isFramed = false;
+    this.moved(true);
   }
 }

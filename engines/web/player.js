@@ -46,7 +46,7 @@ export class Player {
     this.overlay.classList.add("handles");
     this.message = element("div", {className: "message", role: "alert", hidden: true});
     this.status = element("p", {className: "status"});
-    this.orbit = new Orbit(this.canvas, () => this.moved());
+    this.orbit = new Orbit(this.canvas, (isByHand) => this.moved(isByHand));
     this.lamps = new Lamps(this.overlay, () => this.lightsChanged());
     root.replaceChildren(this.canvas, this.overlay, this.header(), this.panel(), this.transport(), this.message);
     this.bindPage();
@@ -138,13 +138,18 @@ export class Player {
   /** Take another environment; it is made ready when it is first asked for. */
   async choose(name) {
     const given = this.offered()[name];
+    this.wanted = name;
+    this.busy(true);
     try {
       if (given?.hdr) this.environments.set(name, await Environment.load(bytesOf(given.hdr)));
-      this.relight.environment = this.environments.get(name) ?? await Environment.constant([0, 0, 0]);
+      const light = this.environments.get(name) ?? await Environment.constant([0, 0, 0]);
+      if (this.wanted !== name) return;
+      this.relight.environment = light;
       this.change({environment: name});
     } catch (error) {
       this.say(`The environment ${name} cannot be shown: ${error.message}`);
     }
+    this.busy(!this.isLit);
   }
 
   lightsChanged() {
@@ -152,9 +157,12 @@ export class Player {
     this.moved();
   }
 
-  moved() {
-    this.lastMove = performance.now();
-    if (this.state.path && this.orbit.isHeld) this.change({path: false});
+  moved(isByHand = false) {
+    this.lastMove = now();
+    if (this.state.path && isByHand) {
+      this.orbit.adopt(this.settings.view.cameras[this.frame]);
+      this.change({path: false});
+    }
     this.wake();
   }
 
@@ -166,20 +174,31 @@ export class Player {
   /** Draw if anything changed: coarse where the device is slow and something moves, then finer, then in full. */
   async tick(now) {
     if (!this.isReady || this.vr || this.isDrawing) return;
-    const passed = Math.min((now - (this.lastTick ?? now)) / 1000, 0.25), rest = this.state.playing ? 0 : now - this.lastMove;
+    const passed = Math.min((now - (this.lastTick ?? now)) / 1000, 1), rest = this.state.playing ? 0 : now - this.lastMove;
     if (this.state.playing) this.advance(passed);
     const step = rest < STILL ? this.scale : rest < 5 * STILL ? Math.max(this.scale - 2, 0) : 0, isDue = this.isChanged || this.state.playing;
     [this.lastTick, this.isChanged] = [rest < STILL ? now : null, false];
     if (isDue || step !== this.drawn) {
-      this.isDrawing = true;
-      this.draw(SCALES[step], this.shadows[step]);
-      const milliseconds = await finished(this.relight.gpu);
-      this.isDrawing = false;
+      const milliseconds = await this.timed(SCALES[step], this.shadows[step]);
       if (step === this.scale && isDue) this.adapt(milliseconds);
       this.drawn = step;
       this.tell(milliseconds);
     }
     if (rest < STILL || step || this.isChanged) this.wake(false);
+  }
+
+  /** Draw, and return how long the device took [ms]; no other picture is begun meanwhile. */
+  async timed(scale, shadows) {
+    this.isDrawing = true;
+    try {
+      this.draw(scale, shadows);
+      return await finished(this.relight.gpu);
+    } catch (error) {
+      this.say(`This cannot be drawn: ${error.message}`);
+      return 0;
+    } finally {
+      this.isDrawing = false;
+    }
   }
 
   advance(seconds) {
@@ -277,7 +296,7 @@ export class Player {
 
   panel() {
     this.shown = {};
-    this.picker = element("input", {type: "file", accept: ".b4d,.hdr", hidden: true, onchange: () => this.take_(this.picker.files)});
+    this.picker = element("input", {type: "file", accept: ".b4d,.hdr", hidden: true, onchange: () => this.takeFiles(this.picker.files)});
     const kind = element("select", {ariaLabel: "New light"}, ...["point", "spot", "directional"].map((name) => element("option", {textContent: name})));
     const add = element("button", {className: "word", textContent: "Add light", onclick: () => this.lamps.add(kind.value)});
     this.side = element("aside", {ariaLabel: "Controls", hidden: innerWidth < 700},
@@ -354,7 +373,7 @@ export class Player {
 
   bindPage() {
     const keys = {" ": () => this.change({playing: !this.state.playing}), f: () => this.frameSubject(), ",": () => this.step(-1), ".": () => this.step(1),
-      Escape: () => this.hush()};
+      Escape: () => this.message.classList.contains("fatal") || this.hush()};
     addEventListener("keydown", (event) => {
       const isTyping = event.target.matches?.("input, select, button, summary, [role=slider]") && event.key !== "Escape";
       if (isTyping || event.ctrlKey || event.metaKey || event.altKey || !(event.key in keys)) return;
@@ -362,7 +381,7 @@ export class Player {
       keys[event.key]();
     });
     addEventListener("dragover", (event) => event.preventDefault());
-    addEventListener("drop", (event) => { event.preventDefault(); this.take_(event.dataTransfer.files); });
+    addEventListener("drop", (event) => { event.preventDefault(); this.takeFiles(event.dataTransfer.files); });
     new ResizeObserver(() => this.resized()).observe(this.root);
     this.change({background: this.state.background});
   }
@@ -377,7 +396,7 @@ export class Player {
   }
 
   /** Open files that were chosen or dropped: a take, environments. */
-  async take_(files) {
+  async takeFiles(files) {
     for (const file of files) {
       if (file.name.endsWith(".b4d")) await this.open(file, file.name.slice(0, -4));
       else await this.addEnvironment(file);
