@@ -213,13 +213,12 @@ export class WebGPU {
       if (!adapter) throw new GpuError("this browser must offer WebGPU, got no adapter. Use WebGL2.");
       const wanted = ["float32-blendable"].filter((name) => adapter.features.has(name));
       const limit = adapter.limits.maxColorAttachmentBytesPerSample;
-      if (limit < 48) throw new GpuError(`WebGPU must draw 48 bytes a pixel, got ${limit}. Use WebGL2.`);
       device = await adapter.requestDevice({requiredFeatures: wanted, requiredLimits: {maxColorAttachmentBytesPerSample: limit,
         maxTextureDimension2D: adapter.limits.maxTextureDimension2D, maxBufferSize: adapter.limits.maxBufferSize}});
       features = device.features;
     }
     const gpu = Object.assign(new WebGPU(), {device, canvas, name: "webgpu", made: new Set(),
-      blendFormat: features.has("float32-blendable") ? "rgba32float" : "rgba16float"});
+      blendFormat: features.has("float32-blendable") && device.limits.maxColorAttachmentBytesPerSample >= 48 ? "rgba32float" : "rgba16float"});
     gpu.context = canvas?.getContext("webgpu");
     if (canvas && !gpu.context) throw new GpuError("the canvas must be free for WebGPU, got one with another context. Make a new one.");
     gpu.format = canvas ? navigator.gpu.getPreferredCanvasFormat() : "rgba8unorm";

@@ -19,7 +19,7 @@ import {sorter} from "./sorting.js";
 
 const {ROW, ORDER, CHANNELS, BINS} = passes;
 const MAX_LAYERS = 256, LAYER_ROWS = 2048, KEPT_SEGMENTS = 3, RETRY_MS = 2000, THICKEST = 0.02;
-const SHADOW_FILTERS = [0.1, 0.01, 1, 0], FAR_AWAY = 3e38;
+const SHADOW_FILTERS = [0.1, 0.01, 1, 0];
 /** What stands for arrays that a container lacks. */
 const DEFAULTS = {base_color: [0.5, 0.5, 0.5], roughness: [0.5], ambient_occlusion: [1]};
 const TRANSFORMS = ["standard", "aces", "agx", "neutral"];
@@ -63,7 +63,7 @@ export class Relight extends EventTarget {
   static async create(canvas, {backend, context = null, device = null, shadowMapSize = 1024} = {}) {
     require([undefined, "webgpu", "webgl2"].includes(backend), "backend must be webgpu or webgl2", backend);
     require(Number.isInteger(shadowMapSize) && shadowMapSize >= 16 && shadowMapSize <= 8192, "shadowMapSize must be in [16, 8192]", shadowMapSize);
-    const relight = Object.assign(new Relight(), {canvas, shadowMapSize, rotation: 0, exposure: 0, viewTransform: "standard",
+    const relight = Object.assign(new Relight(), {canvas, shadowMapSize, rotation: 0, environmentGain: 1, exposure: 0, viewTransform: "standard",
       channel: "relit", background: null, depthRange: null});
     relight.#environment = await Environment.constant();
     await relight.#start(async () => {
@@ -85,10 +85,10 @@ export class Relight extends EventTarget {
     this.backend = this.gpu.name;
     const {blendFormat: format} = this.gpu, program = (spec) => this.gpu.program(spec);
     this.#programs = {
-      geometry: program(passes.geometry), materials: program(passes.materials), gbuffer: program(passes.gbuffer(format)),
+      geometry: program(passes.geometry), materials: program(passes.materials), normals: program(passes.normals), gbuffer: program(passes.gbuffer(format)),
       deferred: program(passes.deferred({glsl: GLSL + GLSL_FETCHING, wgsl: WGSL + WGSL_FETCHING})), display: program(passes.display({glsl: GLSL, wgsl: WGSL}, this.backend === "webgl2" && !!this.canvas)),
     };
-    this.#textures = {nothing: this.#filled([FAR_AWAY, 0, 0, 0]), noMap: this.gpu.texture({width: 1, height: 1, layers: 1, format: "rgba32float"})};
+    this.#textures = {nothing: this.#filled([0, 0, 0, 0]), noMap: this.gpu.texture({width: 1, height: 1, layers: 1, format: "rgba32float"})};
     this.#upload(this.#environment);
     this.gpu.onLost((message) => this.#lost(message));
   }
@@ -321,8 +321,9 @@ export class Relight extends EventTarget {
     if (!segment || this.#evaluated?.key === key) return;
     const {heads, terms, at} = this.#sums(place), t = this.#textures;
     const textures = {still: t.still, summed: segment.summed ?? t.none, plain: segment.plain ?? t.noInts}, uniforms = {heads, terms};
-    this.gpu.draw(this.#programs.geometry, {targets: [t.positions, t.orientations, t.scales], uniforms, textures});
-    this.gpu.draw(this.#programs.materials, {targets: [t.colors, t.normals], uniforms, textures});
+    for (const [name, targets] of [["geometry", [t.positions, t.orientations]], ["materials", [t.scales, t.colors]], ["normals", [t.normals]]]) {
+      this.gpu.draw(this.#programs[name], {targets, uniforms, textures});
+    }
     this.#evaluated = {key, at};
   }
 
@@ -452,9 +453,24 @@ export class Relight extends EventTarget {
       this.gpu.draw(this.#programs.depths, {...this.#splats(view, order, SHADOW_FILTERS), targets: [sums], clear: [0, 0, 0, 0]});
       const medians = this.#median(view, order, SHADOW_FILTERS, "shadowMedians");
       const meshes = this.meshDepth?.(view, k) ?? this.#textures.nothing;
-      this.gpu.draw(this.#programs.texels, {targets: [[shadows, k]], textures: {sums, medians, meshes}});
+      this.gpu.draw(this.#programs.texels, {targets: [[shadows, k]], textures: {sums, medians, behindOf: meshes}, uniforms: {meshes: [meshes.width, 0, 0, 0]}});
     });
     this.#maps.drawn = true;
+  }
+
+  /** Cameras of the lamps' shadow maps, as they were drawn last; `meshDepth(view, k)` may return depths of meshes for them. */
+  get shadowViews() {
+    return this.#maps.views.flat();
+  }
+
+  /** Draw shadow maps again: meshes have moved. */
+  redrawShadows() {
+    this.#maps.drawn = false;
+  }
+
+  /** Return a texture by its name, to be read by others who draw with the same GPU: "lit", "sums2", "positions" …. */
+  texture(name) {
+    return this.#textures[name];
   }
 
   /** Draw what is at hand now, lit, into textures: true if there is anything. */
@@ -487,7 +503,7 @@ export class Relight extends EventTarget {
     const lit = this.#texture("lit", width, height, "rgba32float");
     this.gpu.draw(this.#programs.deferred, {targets: [lit], textures: {sums0: sums[0], sums1: sums[1], sums2: sums[2], medians,
       environment: t.environment, albedo: t.albedo, shadows: this.#textures.shadows ?? t.noMap},
-    uniforms: {...cameraNumbers(view, 0), turn: [Math.cos(angle), Math.sin(angle), 0, 0], levels: this.levels, lamps,
+    uniforms: {...cameraNumbers(view, 0), turn: [Math.cos(angle), Math.sin(angle), this.environmentGain, 0], levels: this.levels, lamps,
       counts: [lights.length, this.background === "environment" && this.channel === "relit" ? 1 : 0, 0, 0],
       maps: hasLamps ? this.#maps.views.flat().flatMap((each) => mapNumbers(each, thickness)) : []}});
     return true;

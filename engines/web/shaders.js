@@ -64,34 +64,44 @@ const EVALUATION = {
   textures: [["still", "array"], ["summed", "array"], ["plain", "ints"]],
 };
 
-/** Writes centre and opacity, orientation, standard deviations and roughness; in the world, z up. */
+/** Writes centre and opacity, and the orientation; in the world, z up. */
 export const geometry = {
-  name: "geometry", ...EVALUATION, outputs: Array(3).fill("rgba32float"),
+  name: "geometry", ...EVALUATION, outputs: Array(2).fill("rgba32float"),
   fragment: `${EVALUATE}
 void fragmentMain() {
   ivec2 cell = ivec2(pixel);
   out0 = vec4(toWorld(vectorAt(${ORDER.positions}, cell)), clamp(component(${ORDER.opacities}, cell), 0.0, 1.0));
   vec4 q = turnedBy(quaternionOf(vectorAt(${ORDER.turns}, cell)), quaternionOf(vectorAt(${ORDER.orientations}, cell)));
   out1 = turnedBy(vec4(0.70710678, 0.0, 0.0, 0.70710678), q);
-  vec3 logarithms = vectorAt(${ORDER.scales}, cell);
-  out2 = vec4(exp(min(logarithms, vec3(20.0))) * step(vec3(-29.0), logarithms), clamp(component(${ORDER.roughness}, cell), 0.0, 1.0));
 }
 `,
 };
 
-/** Writes base colour and ambient occlusion, and the normal. */
+/** Writes standard deviations and roughness, base colour and ambient occlusion. */
 export const materials = {
   name: "materials", ...EVALUATION, outputs: Array(2).fill("rgba32float"),
   fragment: `${EVALUATE}
 void fragmentMain() {
   ivec2 cell = ivec2(pixel);
+  vec3 logarithms = vectorAt(${ORDER.scales}, cell);
+  out0 = vec4(exp(min(logarithms, vec3(20.0))) * step(vec3(-29.0), logarithms), clamp(component(${ORDER.roughness}, cell), 0.0, 1.0));
   vec3 color = clamp(vectorAt(${ORDER.base_color}, cell), vec3(0.0), vec3(1.0));
-  out0 = vec4(color, clamp(component(${ORDER.ambient_occlusion}, cell), 0.0, 1.0));
+  out1 = vec4(color, clamp(component(${ORDER.ambient_occlusion}, cell), 0.0, 1.0));
+}
+`,
+};
+
+/** Writes the normal. */
+export const normals = {
+  name: "normals", ...EVALUATION, outputs: ["rgba32float"],
+  fragment: `${EVALUATE}
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
   vec3 normal = vectorAt(${ORDER.normals}, cell);
   normal = normal / max(length(normal), 1.0e-12);
   vec4 turn = quaternionOf(vectorAt(${ORDER.turns}, cell));
   vec3 middle = 2.0 * cross(turn.xyz, normal);
-  out1 = vec4(toWorld(normal + turn.w * middle + cross(turn.xyz, middle)), 0.0);
+  out0 = vec4(toWorld(normal + turn.w * middle + cross(turn.xyz, middle)), 0.0);
 }
 `,
 };
@@ -321,13 +331,16 @@ void fragmentMain() {
 
 /** A shadow map's texel: alpha, median depth, mean depth, depth of meshes. */
 export const texels = {
-  name: "texels", textures: [["sums", "float2d"], ["medians", "float2d"], ["meshes", "float2d"]], outputs: ["rgba32float"],
+  name: "texels", uniforms: [["meshes"]], textures: [["sums", "float2d"], ["medians", "float2d"], ["behindOf", "float2d"]], outputs: ["rgba32float"],
   fragment: `
 void fragmentMain() {
   ivec2 cell = ivec2(pixel);
   vec4 seen = fetch(sums, cell, 0);
   vec4 middle = fetch(medians, cell, 0);
-  float behind = fetch(meshes, ivec2(0, 0), 0).x;
+  float behind = fetch(behindOf, min(cell, ivec2(int(u.meshes.x) - 1)), 0).x;
+  if (!(behind > 0.0)) {
+    behind = 3.0e38;
+  }
   out0 = vec4(min(seen.w, 1.0), middle.x / max(middle.y, 1.0e-12), seen.z / max(seen.w, 1.0e-12), behind);
 }
 `,
@@ -411,7 +424,7 @@ void fragmentMain() {
       depth = min(depth, middle.x / max(middle.y, 1.0e-12));
     }
     Surface surface = surfaceOfSums(color.xyz, rest.x, rest.y, normal, alpha, u.eye.xyz, ray, depth);
-    vec3 radiance = environmentRadiance(surface, u.turn.xy);
+    vec3 radiance = environmentRadiance(surface, u.turn.xy) * u.turn.z;
     vec2 turn = randomTurn(uint(cell.y) * uint(u.image.x) + uint(cell.x));
     for (int k = 0; k < int(u.counts.x); k++) {
       radiance += lampRadiance(surface, lampAt(k), turn);
@@ -421,7 +434,7 @@ void fragmentMain() {
   }
   if (u.counts.y > 0.5) {
     vec3 ray = pixelRay(pixel, u.lens.xy, u.lens.zw, u.right.xyz, u.down.xyz, u.forward.xyz);
-    out0 = vec4(out0.xyz + (1.0 - out0.w) * levelRadiance(0, unturned(normalize(ray), u.turn.xy)), 1.0);
+    out0 = vec4(out0.xyz + (1.0 - out0.w) * u.turn.z * levelRadiance(0, unturned(normalize(ray), u.turn.xy)), 1.0);
   }
 }
 `,

@@ -1,0 +1,99 @@
+"""Pages of headless Chromium that hold the module `beam-relight`, and what they send back.
+
+WebGPU has no GPU here, but SwiftShader. With the flags that WebGL2 needs, it draws into textures, and loses its device as
+soon as a canvas shows what it drew; with `CANVAS_FLAGS` canvases work, and there is no WebGL2.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from web.viewers import CHROMIUM, HERE
+
+from beam_warp.world.camera import Camera
+
+MODULE = Path(__file__).parents[3] / "engines" / "web"
+FLAGS = (
+    *("--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--ignore-gpu-blocklist", "--enable-unsafe-swiftshader", "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"),
+    "--js-flags=--expose-gc",
+)
+BOTH_FLAGS = ("--use-angle=swiftshader",)
+CANVAS_FLAGS = ("--use-angle=vulkan", "--use-vulkan=swiftshader", "--enable-features=Vulkan")
+BACKENDS = ("webgl2", "webgpu")
+
+START = """<!doctype html><canvas id="canvas"></canvas><script type="module">
+import * as relight from "/module/index.js";
+Object.assign(window, relight);
+window.heard = [];
+window.make = async (options, canvas = null) => {
+  const made = await Relight.create(canvas, options);
+  for (const type of ["stalled", "resumed", "lost", "restored", "error"])
+    made.addEventListener(type, (event) => heard.push([type, event.detail.message ?? ""]));
+  return made;
+};
+window.packed = (numbers) => {
+  const bytes = new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength);
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
+};
+window.isThere = true;
+</script>"""
+
+
+@contextmanager
+def chromium(more: tuple[str, ...] = BOTH_FLAGS) -> Iterator[Any]:
+    """Start a browser without a screen or a GPU, in which WebGL2 and WebGPU draw."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *more])
+        yield browser
+        browser.close()
+
+
+def open_page(browser: Any, files: Mapping[str, bytes | Path], start: str = START) -> Any:
+    """Open a page that imports the module; ``files`` are at hand by their names, and may be changed while it is open."""
+    page = browser.new_page()
+
+    def answer(route: Any) -> None:
+        name = route.request.url.split("?")[0].removeprefix(HERE)
+        content = MODULE / name.removeprefix("module/") if name.startswith("module/") else files.get(name)
+        if not name:
+            route.fulfill(body=start, content_type="text/html")
+        elif content is None or (isinstance(content, Path) and not content.is_file()):
+            route.fulfill(status=404)
+        elif isinstance(content, Path):
+            kind = "text/javascript" if content.suffix == ".js" else "application/octet-stream"
+            route.fulfill(path=content, content_type=kind)
+        else:
+            route.fulfill(body=content, content_type="application/octet-stream")
+
+    page.route("**/*", answer)
+    page.goto(HERE)
+    page.wait_for_function("window.isThere", timeout=60_000)
+    return page
+
+
+def numbers(packed: str, *shape: int, dtype: Any = np.float32) -> NDArray[Any]:
+    """Return an array that a page sent by ``packed``."""
+    return np.frombuffer(base64.b64decode(packed), dtype).reshape(*shape)
+
+
+def camera_record(camera: Camera) -> dict[str, Any]:
+    """Return a camera as `Relight.draw` takes it."""
+    return {
+        "position": camera.position.tolist(),
+        "worldToCamera": camera.world_to_camera[:3, :3].ravel().tolist(),
+        "focal": [camera.focal_x, camera.focal_y],
+        "center": [camera.center_x, camera.center_y],
+        "width": camera.width,
+        "height": camera.height,
+    }
