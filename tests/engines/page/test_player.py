@@ -36,6 +36,10 @@ pytestmark = pytest.mark.slow
 
 WIDTH, HEIGHT = 800, 420
 PATIENCE = 120.0
+WEBGPU = (
+    *("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--use-angle=vulkan", "--use-vulkan=swiftshader"),
+    "--enable-features=Vulkan",
+)
 FRAMES = 14
 """One more segment than one."""
 
@@ -71,11 +75,17 @@ def written(take, light, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def browser():
+def browsers():
+    """Starts browsers: one without WebGPU, or one without WebGL 2."""
     with sync_api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        yield opened
-        opened.close()
+        yield lambda flags: playwright.chromium.launch(executable_path=CHROMIUM, args=list(flags))
+
+
+@pytest.fixture(scope="module")
+def browser(browsers):
+    opened = browsers(FLAGS)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture
@@ -83,8 +93,8 @@ def opened(browser):
     """Opens a page that stands still; in the end, nothing must have gone wrong in it."""
     pages, wrong = [], []
 
-    def open_page(path, script=None, **options):
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, reduced_motion="reduce", **options)
+    def open_page(path, script=None, browser=browser):
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, reduced_motion="reduce")
         pages.append(page)
         page.on("pageerror", lambda error: wrong.append(str(error)))
         if script:
@@ -100,9 +110,13 @@ def opened(browser):
 
 @pytest.fixture
 def page(opened, written):
-    shown = opened(written)
-    until(shown, "window.player?.isReady && player.drawn === 0 && !player.isDrawing")
-    return shown
+    return ready(opened(written))
+
+
+def ready(page):
+    """Wait for the first picture."""
+    until(page, "window.player?.isReady && player.drawn === 0 && !player.isDrawing")
+    return page
 
 
 def until(page, condition):
@@ -132,7 +146,11 @@ def said(page):
     return page.locator(".message p").inner_text()
 
 
-def test_it_shows_what_the_renderer_shows(page, light):
+@pytest.mark.parametrize("backend", ["webgl2", "webgpu"])
+def test_it_shows_what_the_renderer_shows(opened, written, light, browsers, browser, backend):
+    other = browser if backend == "webgl2" else browsers((*FLAGS, *WEBGPU))
+    page = ready(opened(written, browser=other))
+    assert page.evaluate("player.relight.backend") == backend
     seen = picture(page).astype(np.float64)
     given = page.evaluate("player.orbit.camera(player.canvas.width, player.canvas.height, player.free())")
     pose = np.eye(4)
@@ -143,6 +161,9 @@ def test_it_shows_what_the_renderer_shows(page, light):
     expected = display_over(image.rgb, image.alpha, background=np.full(3, 33 / 255.0))
     assert image.alpha.mean() > 0.1
     assert psnr(seen / 255.0, expected / 255.0, image.alpha > 0.99) > 38.0
+    if other is not browser:
+        page.close()
+        other.close()
 
 
 def test_keys_play_step_and_orbit(page):
@@ -267,7 +288,7 @@ def test_a_lost_segment_holds_the_last_frame_and_says_so(opened, written, tmp_pa
         return content[: at + 20] + bytes([content[at + 20] ^ 255]) + content[at + 21 :]
 
     page = opened(altered(written, tmp_path, spoil))
-    until(page, "window.player?.isReady && player.drawn === 0")
+    ready(page)
     page.evaluate("player.change({time: 1.1})")
     held = picture(page)
     page.evaluate("player.change({time: 1.3})")
@@ -310,7 +331,7 @@ def test_it_plays_in_a_headset(opened, written):
         pytest.skip(f"the emulator cannot be had: {error}")
     headset = ";new IWER.XRDevice(IWER.metaQuest3, {stereoEnabled: true}).installRuntime({forceInstall: true});"
     page = opened(written, emulator.read_text() + headset)
-    until(page, "window.player?.isReady && player.drawn === 0")
+    ready(page)
     page.get_by_role("button", name="Enter VR").click()
     until(page, "player.vr?.session.renderState.baseLayer")
     page.evaluate("player.change({playing: true})")

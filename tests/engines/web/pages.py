@@ -20,8 +20,19 @@ from beam_warp.world.camera import Camera
 
 MODULE = Path(__file__).parents[3] / "engines" / "web"
 FLAGS = (
-    *("--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    *("--ignore-gpu-blocklist", "--enable-unsafe-swiftshader", "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"),
+    *(
+        "--no-sandbox",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ),
+    *(
+        "--ignore-gpu-blocklist",
+        "--enable-unsafe-swiftshader",
+        "--enable-unsafe-webgpu",
+        "--use-webgpu-adapter=swiftshader",
+    ),
     "--js-flags=--expose-gc",
 )
 BOTH_FLAGS = ("--use-angle=swiftshader",)

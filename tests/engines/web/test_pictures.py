@@ -58,7 +58,14 @@ def test_a_probe_looks_as_the_deferred_renderer_draws_it_on_both_backends(name, 
             files[key] = tmp_path / key
         lighting = "dim" if golden.lighting in LAMPS else golden.lighting
         files[f"{lighting}.f32"] = shot.environment.radiance.tobytes()
-        asked = [name, lighting, shot.environment.height, camera_record(shot.camera), lights_to_json(shot.lights), ROTATION]
+        asked = [
+            name,
+            lighting,
+            shot.environment.height,
+            camera_record(shot.camera),
+            lights_to_json(shot.lights),
+            ROTATION,
+        ]
         truth = display_over(golden.image.rgb, np.minimum(golden.image.alpha, 1.0), background=(0.5, 0.5, 0.5))
         pictures = {}
         for backend, page in pages.items():

@@ -74,8 +74,17 @@ def page(tmp_path_factory):
     except npm_packages.MissingPackagesError as error:
         pytest.skip(f"three.js cannot be had: {error}")
     path = tmp_path_factory.mktemp("three") / "ball.b4d"
-    write(GaussianSequence.from_clouds([drawn_ball(color=(0.8, 0.4, 0.2), count=4000).with_arrays(
-        radiance=None, radiance_color_space=None, scales=np.tile([0.025, 0.025, 1e-4], (4000, 1)))]), path, WriteOptions())
+    write(
+        GaussianSequence.from_clouds(
+            [
+                drawn_ball(color=(0.8, 0.4, 0.2), count=4000).with_arrays(
+                    radiance=None, radiance_color_space=None, scales=np.tile([0.025, 0.025, 1e-4], (4000, 1))
+                )
+            ]
+        ),
+        path,
+        WriteOptions(),
+    )
     files = {name: three / name for name in ("three.module.js", "three.core.js")} | {"ball.b4d": path}
     assert (MODULE / "three.js").is_file()
     with chromium() as browser:
