@@ -36,6 +36,7 @@ export function checkedLights(records) {
       if (fields[field] === null) {
         require(Array.isArray(value) && value.length === 3 && value.every(Number.isFinite), `${name}.${field} must be three numbers`, value);
       } else if (field in RANGES) {
+        require(typeof value === "number", `${name}.${field} must be a number`, value);
         require(value >= RANGES[field][0] && value <= RANGES[field][1], `${name}.${field} must be in [${RANGES[field]}]`, value);
       } else require(typeof value === "boolean", `${name}.${field} must be true or false`, value);
     }

@@ -17,7 +17,8 @@ import * as passes from "./shaders.js";
 import {GLSL, GLSL_FETCHING, WGSL, WGSL_FETCHING} from "./shading.js";
 import {sorter} from "./sorting.js";
 
-const {ROW, ORDER, CHANNELS, BINS} = passes;
+const {ROW, ORDER, RADIANCE, CHANNELS, BINS} = passes;
+const isStored = (name) => name in ORDER || name in RADIANCE;
 const MAX_LAYERS = 256, LAYER_ROWS = 2048, KEPT_SEGMENTS = 3, RETRY_MS = 2000, THICKEST = 0.02;
 const SHADOW_FILTERS = [0.1, 0.01, 1, 0];
 /** What stands for arrays that a container lacks. */
@@ -161,7 +162,7 @@ export class Relight extends EventTarget {
     this.#take = take;
     this.#sorter ??= sorter();
     this.rows = rows;
-    const stored = this.#store(Object.entries(take.raw).filter(([name]) => name in ORDER).flatMap(([name, values]) =>
+    const stored = this.#store(Object.entries(take.raw).filter(([name]) => isStored(name)).flatMap(([name, values]) =>
       Array.from({length: values.length / Math.max(count, 1)}, (_, c) => [`${name}${c}`, values.subarray(c * count, (c + 1) * count)])), "float");
     this.#textures.still = stored.texture;
     this.still = stored.places;
@@ -251,7 +252,7 @@ export class Relight extends EventTarget {
     try {
       const tracks = await take.tracks(entry, entry.frames);
       if (take !== this.#take || this.#isDisposed || this.#isLost) return null;
-      const named = Object.entries(tracks).filter(([name]) => name in ORDER).flatMap(([name, components]) =>
+      const named = Object.entries(tracks).filter(([name]) => isStored(name)).flatMap(([name, components]) =>
         components.flatMap(({planes}, c) => planes.map((values, k) => [`${name}${c}/${k}`, values])));
       const summed = this.#store(named.filter(([, values]) => values instanceof Float32Array), "float");
       const plain = this.#store(named.filter(([, values]) => values instanceof Int8Array), "int");
@@ -276,17 +277,17 @@ export class Relight extends EventTarget {
   /** Keep the segments nearest to what is shown. */
   #forget() {
     const wanted = this.#place().number, distance = (number) => number >= wanted ? number - wanted : 1.5 * (wanted - number);
-    const far = [...this.#segments.keys()].sort((a, b) => distance(a) - distance(b)).slice(KEPT_SEGMENTS);
+    const shown = this.#evaluated?.place.number, far = [...this.#segments.keys()].filter((number) => number !== shown).sort((a, b) => distance(a) - distance(b)).slice(KEPT_SEGMENTS - 1);
     for (const number of far) {
       this.#free(this.#segments.get(number));
       this.#segments.delete(number);
     }
   }
 
-  /** Return the sums that give a frame: offsets and terms of every component. */
-  #sums({number, local, share}) {
-    const segment = this.#segments.get(number), heads = new Float32Array(4 * passes.COMPONENTS), terms = [], forSorter = {heads: [0, 0, 0], terms: [[], [], []]};
-    for (const [name, start] of Object.entries(ORDER)) {
+  /** Return the sums that give a frame: offsets and terms of every component of arrays, whose places are given. */
+  #sums({number, local, share}, arrays = ORDER, components = passes.COMPONENTS) {
+    const segment = this.#segments.get(number), heads = new Float32Array(4 * components), terms = [], forSorter = {heads: [0, 0, 0], terms: [[], [], []]};
+    for (const [name, start] of Object.entries(arrays)) {
       const size = {opacities: 1, roughness: 1, ambient_occlusion: 1}[name] ?? 3, tracks = segment.weights[name];
       for (let c = 0; c < size; c++) {
         const first = terms.length, place = this.still[`${name}${c}`];
@@ -324,7 +325,7 @@ export class Relight extends EventTarget {
     for (const [name, targets] of [["geometry", [t.positions, t.orientations]], ["materials", [t.scales, t.colors]], ["normals", [t.normals]]]) {
       this.gpu.draw(this.#programs[name], {targets, uniforms, textures});
     }
-    this.#evaluated = {key, at};
+    this.#evaluated = {key, at, place, textures};
   }
 
   // ---- Light
@@ -444,6 +445,20 @@ export class Relight extends EventTarget {
     return out;
   }
 
+  /** Channels that the take has. */
+  get channels() {
+    return CHANNELS.filter((name) => name !== "radiance" || (this.#take && "radiance_0" in this.#take.raw));
+  }
+
+  /** Return captured colours towards a camera. */
+  #captured(view) {
+    const {place, textures} = this.#evaluated, bands = Object.keys(RADIANCE).filter((name) => name in this.#take.raw).length;
+    const {heads, terms} = this.#sums(place, RADIANCE, 75), {positions} = this.#textures, target = this.#texture("captured", ROW, this.rows, "rgba32float");
+    this.#programs.captured ??= this.gpu.program(passes.captured);
+    this.gpu.draw(this.#programs.captured, {targets: [target], textures: {...textures, positions}, uniforms: {heads, terms, eye: [...view.position, bands]}});
+    return target;
+  }
+
   #drawMaps() {
     const views = this.#maps.views.flat(), size = this.shadowMapSize;
     if (this.#maps.drawn || !views.length) return;
@@ -486,7 +501,9 @@ export class Relight extends EventTarget {
     const t = this.#textures, format = this.gpu.blendFormat, {raster_low_pass: low, raster_antialiased: thin} = this.#take.manifest.metadata ?? {};
     const filters = [Number(low) > 0 ? Number(low) : 0.3, 0.01, thin === "true" ? 1 : 0, 0];
     const sums = [0, 1, 2].map((k) => this.#texture(`sums${k}`, width, height, format));
-    this.gpu.draw(this.#programs.gbuffer, {...this.#splats(view, order, filters), targets: sums, clear: [0, 0, 0, 0]});
+    const splats = this.#splats(view, order, filters);
+    if (this.channel === "radiance") splats.textures.colors = this.#captured(view);
+    this.gpu.draw(this.#programs.gbuffer, {...splats, targets: sums, clear: [0, 0, 0, 0]});
     const lights = this.#lights.length ? this.#maps.lights ?? [] : [], hasLamps = lights.length > 0; // those that maps are of
     if (hasLamps) {
       this.#lampPrograms();
@@ -511,17 +528,17 @@ export class Relight extends EventTarget {
 
   /** Draw what is at hand now on the canvas. After `sorted`, draw again: the order of depth has been found. */
   draw(camera) {
-    const isThere = this.shade(camera), {width, height} = camera, channel = CHANNELS.indexOf(this.channel), transform = TRANSFORMS.indexOf(this.viewTransform);
-    require(channel >= 0, `channel must be one of ${CHANNELS.join(", ")}`, this.channel);
+    const {width, height} = camera, channel = CHANNELS.indexOf(this.channel), transform = TRANSFORMS.indexOf(this.viewTransform);
+    require(!this.#take || this.channels.includes(this.channel), `channel must be one of ${this.channels.join(", ")}`, this.channel);
     require(transform >= 0, `viewTransform must be one of ${TRANSFORMS.join(", ")}`, this.viewTransform);
     require(Number.isFinite(this.exposure) && Math.abs(this.exposure) <= 64, "exposure must be in [-64, 64] stops", this.exposure);
-    if (!isThere) return false;
+    if (!this.shade(camera)) return false;
     const {canvas} = this, t = this.#textures, target = camera.target;
     if (canvas && !target && (canvas.width !== width || canvas.height !== height)) Object.assign(canvas, {width, height});
     const targets = canvas || target ? [] : [this.#texture("picture", width, height, "rgba8unorm")];
     const behind = Array.isArray(this.background) ? [...this.background, 1] : [0, 0, 0, 0];
     this.gpu.draw(this.#programs.display, {textures: {lit: t.lit, sums0: t.sums0, sums1: t.sums1, sums2: t.sums2}, target, targets,
-      uniforms: {image: [width, height, target?.x ?? 0, target?.y ?? 0], tone: [2 ** this.exposure, transform, channel, 0],
+      uniforms: {image: [width, height, target?.x ?? 0, target?.y ?? 0], tone: [2 ** this.exposure, transform, channel, this.#take.manifest.radianceColorSpace === "srgb_rec709_display" ? 1 : 0],
         background: behind, range: this.depthRange ?? this.#depthRange(viewOf(camera))}});
     return true;
   }

@@ -15,6 +15,9 @@ export const LAMPS = 16, MAPS = 24;
 /** Splats are divided into this many bins, and each bin into as many again, to find the median. */
 export const BINS = 16;
 
+/** The same for captured colour: coefficients of spherical harmonics. */
+export const RADIANCE = Object.fromEntries(Array.from({length: 25}, (_, k) => [`radiance_${k}`, 3 * k]));
+
 /** Components of a Gaussian as the evaluation numbers them. */
 export const ORDER = {positions: 0, orientations: 3, turns: 6, scales: 9, opacities: 12, base_color: 13, roughness: 16};
 Object.assign(ORDER, {ambient_occlusion: 17, normals: 18});
@@ -102,6 +105,38 @@ void fragmentMain() {
   vec4 turn = quaternionOf(vectorAt(${ORDER.turns}, cell));
   vec3 middle = 2.0 * cross(turn.xyz, normal);
   out0 = vec4(toWorld(normal + turn.w * middle + cross(turn.xyz, middle)), 0.0);
+}
+`,
+};
+
+/** Real spherical harmonics of a unit vector x, y, z, of degree 0 to 4. */
+const HARMONICS = ["0.28209479177387814", "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
+  "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2.0 * zz - xx - yy)", "-1.0925484305920792 * x * z",
+  "0.5462742152960396 * (xx - yy)", "-0.5900435899266435 * y * (3.0 * xx - yy)", "2.890611442640554 * x * y * z",
+  "-0.4570457994644658 * y * (4.0 * zz - xx - yy)", "0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)",
+  "-0.4570457994644658 * x * (4.0 * zz - xx - yy)", "1.445305721320277 * z * (xx - yy)", "-0.5900435899266435 * x * (xx - 3.0 * yy)",
+  "2.5033429417967046 * x * y * (xx - yy)", "-1.7701307697799304 * y * z * (3.0 * xx - yy)", "0.9461746957575601 * x * y * (7.0 * zz - 1.0)",
+  "-0.6690465435572892 * y * z * (7.0 * zz - 3.0)", "0.10578554691520431 * (35.0 * zz * zz - 30.0 * zz + 3.0)",
+  "-0.6690465435572892 * x * z * (7.0 * zz - 3.0)", "0.47308734787878004 * (xx - yy) * (7.0 * zz - 1.0)",
+  "-1.7701307697799304 * x * z * (xx - 3.0 * yy)", "0.6258357354491761 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy))"];
+
+/** Writes the captured colour towards a camera; harmonics are in the container's axes. */
+export const captured = {
+  name: "captured", uniforms: [["heads", 75], ["terms", TERMS], ["eye"]], textures: [...EVALUATION.textures, ["positions", "float2d"]],
+  outputs: ["rgba32float"],
+  fragment: `${EVALUATE}
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
+  vec3 way = normalize(fetch(positions, cell, 0).xyz - u.eye.xyz);
+  float x = way.x;
+  float y = way.z;
+  float z = -way.y;
+  float xx = x * x;
+  float yy = y * y;
+  float zz = z * z;
+  vec3 color = vec3(0.5);
+${HARMONICS.map((basis, k) => `  if (int(u.eye.w) > ${k}) {\n    color += (${basis}) * vectorAt(${3 * k}, cell);\n  }`).join("\n")}
+  out0 = vec4(max(color, vec3(0.0)), 0.0);
 }
 `,
 };
@@ -441,7 +476,7 @@ void fragmentMain() {
 });
 
 /** Names of what can be shown, in the order of their numbers. */
-export const CHANNELS = ["relit", "base_color", "roughness", "ambient_occlusion", "normals", "depth", "alpha"];
+export const CHANNELS = ["relit", "base_color", "roughness", "ambient_occlusion", "normals", "depth", "alpha", "radiance"];
 
 /** The picture on the canvas: exposure, view transform, background; or a channel of the G-buffer. */
 export const display = (shading, flip) => ({
@@ -467,6 +502,9 @@ vec3 channelColor(int channel, ivec2 cell, float alpha) {
   }
   if (channel == 6) {
     color = vec3(1.0);
+  }
+  if (channel == 7 && u.tone.w > 0.5) {
+    color = clamp(fetch(sums0, cell, 0).xyz / alpha, vec3(0.0), vec3(1.0));
   }
   return color;
 }

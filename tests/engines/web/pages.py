@@ -1,7 +1,7 @@
 """Pages of headless Chromium that hold the module `beam-relight`, and what they send back.
 
-WebGPU has no GPU here, but SwiftShader. With the flags that WebGL2 needs, it draws into textures, and loses its device as
-soon as a canvas shows what it drew; with `CANVAS_FLAGS` canvases work, and there is no WebGL2.
+WebGPU has no GPU here, but SwiftShader. With the flags that WebGL2 needs, it draws into textures, and loses its device
+as soon as a canvas shows what it drew; with `CANVAS_FLAGS` canvases work, and there is no WebGL2.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def chromium(more: tuple[str, ...] = BOTH_FLAGS) -> Iterator[Any]:
 
 
 def open_page(browser: Any, files: Mapping[str, bytes | Path], start: str = START) -> Any:
-    """Open a page that imports the module; ``files`` are at hand by their names, and may be changed while it is open."""
+    """Open a page that imports the module; ``files`` are at hand by their names, and may change while it is open."""
     page = browser.new_page()
 
     def answer(route: Any) -> None:
