@@ -115,6 +115,7 @@ def _head(title: str, settings: Mapping[str, Any]) -> str:
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
         f"<title>{html.escape(title)}</title>\n<style>\n{_source('player.css')}</style>\n"
         f'<script type="importmap">{json.dumps({"imports": addresses})}</script>\n</head>\n<body>\n'
         f'<main id="player"><p class="message fatal">{_OLD}</p></main>\n'
