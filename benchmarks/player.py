@@ -44,6 +44,7 @@ FRAME = 4
 PATIENCE = 900.0
 STAGE = {
     "beam-stage": 1,
+    "duration": 0.2,
     "assets": [
         {"path": "dancer.usdc", "translate": [-0.75, 0.25, 0], "rotate": 20, "on_ground": True, "centered": True},
         {"path": "dancer.usdc", "translate": [0.7, -0.2, 0], "rotate": -35, "on_ground": True, "centered": True}
