@@ -261,7 +261,7 @@ export class Player {
   tell(milliseconds) {
     const words = [`${this.take.manifest.count.toLocaleString("en")} Gaussians`, this.relight.backend === "webgpu" ? "WebGPU" : "WebGL 2",
       `${milliseconds < 10 ? milliseconds.toFixed(1) : Math.round(milliseconds)} ms`];
-    if (now() - (this.lastWords ?? 0) > 500) [this.status.textContent, this.lastWords] = [words.join(" · "), now()];
+    if (!this.state.playing || now() - (this.lastWords ?? 0) > 500) [this.status.textContent, this.lastWords] = [words.join(" · "), now()];
   }
 
   // the page
