@@ -58,7 +58,7 @@ STAGE = {
     "environment": {"path": "sunset.exr", "rotate": 60, "exposure": -1.0},
     "camera": {"type": "fixed", "position": [0.4, -5.2, 1.9], "target": [0, 0, 0.8], "fov": 32},
 }
-LAMP = {"type": "point", "position": [-1.1, -0.9, 1.7], "intensity": [5.5, 3.2, 1.6], "radius": 0.05}
+LAMP = {"type": "point", "position": [-0.75, -0.8, 1.5], "intensity": [4.5, 2.9, 1.5], "radius": 0.05}
 
 PLACE = "async (light) => player.lamps.set([(await import('beam-relight/lamps.js')).fromLight(light, player.box)])"
 
@@ -119,6 +119,7 @@ def main() -> int:
         stage, rendered = str(folder / "stage.json"), folder / "render.png"
         beam_convert([str(dancer), str(folder / "dancer.html"), "--player"])
         page = opened(browser, folder / "dancer.html", PAGE)
+        page.evaluate("player.choose('sunset (built in)')")
         page.evaluate(f"({PLACE})({json.dumps(LAMP)})")
         Image.fromarray(photograph(page)).save(IMAGES / "player.jpg", quality=88)
         page.close()

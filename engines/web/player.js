@@ -259,8 +259,8 @@ export class Player {
   busy(is) { this.root.classList.toggle("busy", is); }
 
   tell(milliseconds) {
-    const words = [`${this.take.manifest.count.toLocaleString("en")} Gaussians`, this.relight.backend === "webgpu" ? "WebGPU" : "WebGL 2",
-      `${milliseconds < 10 ? milliseconds.toFixed(1) : Math.round(milliseconds)} ms`];
+    const words = [`${this.take.manifest.count.toLocaleString("en")} Gaussians`, this.relight.backend === "webgpu" ? "WebGPU" : "WebGL 2"];
+    if (this.state.playing) words.push(`${milliseconds < 10 ? milliseconds.toFixed(1) : Math.round(milliseconds)} ms`);
     if (!this.state.playing || now() - (this.lastWords ?? 0) > 500) [this.status.textContent, this.lastWords] = [words.join(" · "), now()];
   }
 
