@@ -309,6 +309,15 @@ def test_a_take_beside_a_page_from_a_file_can_be_chosen(opened, take, tmp_path):
     assert not page.locator(".message").is_visible()
 
 
+def test_a_host_serves_a_page_and_its_take(browser, take, tmp_path):
+    assert main([str(take), str(tmp_path / "page.html"), "--player", "--beside", "--quiet"]) == 0
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, reduced_motion="reduce")
+    page.route("**/*", lambda route: route.fulfill(path=tmp_path / route.request.url.rpartition("/")[2]))
+    page.goto("http://localhost/page.html")
+    assert picture(ready(page)).max() > 60
+    page.close()
+
+
 def test_without_graphics_it_says_what_is_missing(opened, written):
     page = opened(written, "HTMLCanvasElement.prototype.getContext = () => null; delete Navigator.prototype.gpu;")
     assert said(page).startswith("This page needs WebGPU or WebGL 2, and this browser offers neither")
