@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,16 +38,17 @@ def discs_of(mesh: ShotMesh, count: int = 20_000) -> GaussianCloud:
     weights = np.concatenate([np.zeros((0, 3)), *(_middles(n) for n in parts)])[:, None, :]
     normals = (weights @ surface.normals[faces][rows])[:, 0]
     spread = np.sqrt(doubled)[rows] / parts[rows]
-    return GaussianCloud(
-        positions=(weights @ corners[rows])[:, 0],
-        orientations=_turns(across[rows] / np.maximum(doubled[rows, None], 1e-300)),
-        scales=spread[:, None] * np.array([SPREAD, SPREAD, THICKNESS]),
-        opacities=np.full(len(rows), OPACITY),
-        base_color=(weights @ surface.base_color[faces][rows])[:, 0],
-        roughness=(weights[:, 0] * surface.roughness[faces][rows]).sum(axis=1),
-        ambient_occlusion=np.ones(len(rows)),
-        normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
-    )
+    arrays: dict[str, Any] = {
+        "positions": (weights @ corners[rows])[:, 0],
+        "orientations": _turns(across[rows] / np.maximum(doubled[rows, None], 1e-300)),
+        "scales": spread[:, None] * np.array([SPREAD, SPREAD, THICKNESS]),
+        "opacities": np.full(len(rows), OPACITY),
+        "base_color": (weights @ surface.base_color[faces][rows])[:, 0],
+        "roughness": (weights[:, 0] * surface.roughness[faces][rows]).sum(axis=1),
+        "ambient_occlusion": np.ones(len(rows)),
+        "normals": normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
+    }
+    return GaussianCloud(**arrays)
 
 
 def _middles(n: int) -> NDArray[np.float64]:

@@ -36,8 +36,8 @@ def staged_take(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str,
         path: The stage, as `Stage.read` takes it.
 
     Returns:
-        The take; what a player shows first (``state``, ``lights``, a camera for each frame, as
-        ``engines/web/player.js`` reads them); and the stage's environment by its name, if it has one.
+        The take; what a player shows first (``state``, ``lights``, the assets' ``box``, a camera for each
+        frame, as ``engines/web/player.js`` reads them); and the stage's environment by its name, if it has one.
 
     Raises:
         MissingFileError: The file, or one that it names, is not there.
@@ -59,13 +59,15 @@ def staged_take(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str,
     light = stage.environment
     name = f"{path.stem} (stage)"
     turn = 0.0 if light is None else light.rotation_at(0.0)
-    view = {
+    view: dict[str, Any] = {
         "finerShadows": 1 if floor is None else FINER_SHADOWS,
         "state": {"environment": "none" if light is None else name, "rotation": (turn + 180.0) % 360.0 - 180.0},
         "degreesPerSecond": 0.0 if light is None else light.degrees_per_second,
         "lights": lights_to_json(stage.lights),
         "cameras": [_pose(stage, frame) for frame in range(stage.frame_count)],
     }
+    if len(stage.subject):
+        view["box"] = [stage.subject.min(axis=0).tolist(), stage.subject.max(axis=0).tolist()]
     return sequence, view, {} if light is None else {name: light.map}
 
 

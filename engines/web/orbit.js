@@ -8,13 +8,18 @@ export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * 
 export const length = (a) => Math.hypot(...a);
 
 /** Return the box of a take's first frame without strays, in the z-up world [m]. */
-export function bounds(take) {
+export function boundsOf(take) {
   const {positions} = take.still, count = take.manifest.count, low = [], high = [];
   for (const from of [0, 2, 1]) { // x right, y up, z back: the world's y is -z, and its z is y
     const values = positions.slice(from * count, (from + 1) * count).sort(), sign = from === 2 ? -1 : 1;
     const ends = [0.005, 0.995].map((share) => sign * (values[Math.round(share * (count - 1))] ?? sign * (share - 0.5)));
     low.push(Math.min(...ends)), high.push(Math.max(...ends));
   }
+  return boxOf(low, high);
+}
+
+/** Return a box by its corners [m], with its middle and its diagonal. */
+export function boxOf(low, high) {
   const center = low.map((value, k) => 0.5 * (value + high[k]));
   return {low, high, center, extent: Math.max(length(add(high, low, -1)), 1e-3)};
 }

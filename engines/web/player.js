@@ -6,7 +6,7 @@ import {Take} from "./b4d.js";
 import {download, element} from "./elements.js";
 import {Environment} from "./environment.js";
 import {Lamps, fromLight} from "./lamps.js";
-import {Orbit, bounds} from "./orbit.js";
+import {Orbit, boundsOf, boxOf} from "./orbit.js";
 import {Relight} from "./relight.js";
 import {enterVr, hasVr} from "./vr.js";
 
@@ -94,7 +94,7 @@ export class Player {
       this.take = take;
       this.settled = null;
       if (name) document.title = this.title.textContent = name;
-      this.box = bounds(take);
+      this.box = !name && this.settings.view?.box ? boxOf(...this.settings.view.box) : boundsOf(take);
       this.lamps.place(this.box);
       if (!name) this.lamps.set((this.settings.view?.lights ?? []).map((light) => fromLight(light, this.box)));
       this.orbit.frame(this.box, this.free());

@@ -168,6 +168,7 @@ def test_a_stage_becomes_one_take_with_its_light_lamps_and_camera(tmp_path):
     assert len(take[0]) == 16 + len(discs_of(Ground(size=4.0).mesh(CORNERS)))
     assert view["state"] == {"environment": "set (stage)", "rotation": -90.0}
     assert view["degreesPerSecond"] == 8.0
+    assert view["box"][1][0] - view["box"][0][0] == pytest.approx(4.2, abs=0.3)  # two of them, without the ground
     assert view["lights"][0]["intensity"] == [5.0, 4.0, 3.0]
     pose = view["cameras"][1]
     assert pose["fov"] == pytest.approx(40.0)
