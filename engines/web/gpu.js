@@ -314,7 +314,8 @@ return Outputs(${outputs.map((_, k) => `out${k}`).join(", ")}); }`];
     return content;
   }
 
-  onLost(call) {
+  onLost(call, complain) {
+    this.device.addEventListener("uncapturederror", ({error}) => complain(`the GPU refuses a command: ${error.message}`));
     this.device.lost.then(({message, reason}) => { if (!this.isDisposed) call(`the WebGPU device was lost: ${message || reason}`); });
   }
 

@@ -91,7 +91,7 @@ export class Relight extends EventTarget {
     };
     this.#textures = {nothing: this.#filled([0, 0, 0, 0]), noMap: this.gpu.texture({width: 1, height: 1, layers: 1, format: "rgba32float"})};
     this.#upload(this.#environment);
-    this.gpu.onLost((message) => this.#lost(message));
+    this.gpu.onLost((message) => this.#lost(message), (message) => this.#tell("error", {message}));
   }
 
   /** Programs that only lamps need are made when there is the first one. */
@@ -433,14 +433,14 @@ export class Relight extends EventTarget {
   #median(view, order, filters, name) {
     const {gpu} = this, p = this.#programs, {width, height} = view, size = Math.max(Math.ceil(this.#take.manifest.count / BINS), 1);
     const splats = this.#splats(view, order, filters), uniforms = {...splats.uniforms, sizes: [size, Math.max(Math.ceil(size / BINS), 1), 0, 0]};
-    const bins = [0, 1, 2, 3].map((k) => this.#texture(`bins${k}`, width, height, "rgba16float"));
+    const passing = this.#texture("passing", width, height, "rgba16float", BINS / 4), bins = [0, 1, 2, 3].map((k) => [passing, k]);
     const [coarse, fine] = ["coarse", "fine"].map((each) => this.#texture(each, width, height, "rgba32float"));
-    const found = Object.fromEntries(bins.map((texture, k) => [`bins${k}`, texture])), out = this.#texture(name, width, height, this.gpu.blendFormat);
+    const out = this.#texture(name, width, height, this.gpu.blendFormat);
     const run = (program, targets, clear, picked) => gpu.draw(program, {...splats, uniforms, targets, clear, textures: {...splats.textures, picked}});
     run(p.bins, bins, [1, 1, 1, 1]);
-    gpu.draw(p.pick, {targets: [coarse], textures: found});
+    gpu.draw(p.pick, {targets: [coarse], textures: {passing}});
     run(p.fineBins, bins, [1, 1, 1, 1], coarse);
-    gpu.draw(p.finePick, {targets: [fine], textures: {...found, picked: coarse}});
+    gpu.draw(p.finePick, {targets: [fine], textures: {passing, picked: coarse}});
     run(p.median, [out], [0, 0, 0, 0], fine);
     return out;
   }
@@ -569,7 +569,8 @@ export class Relight extends EventTarget {
    * Return what was drawn last, RGBA a pixel, top row first: "lit", floats (radiance times alpha, and alpha); "picture",
    * bytes for a display, of a renderer without a canvas; "sums0" … "sums2" and "medians", the G-buffer.
    */
-  read(name = "lit") {
+  async read(name = "lit") {
+    require(this.#textures[name], "what is read must have been drawn", name);
     return this.gpu.read(this.#textures[name]);
   }
 }

@@ -312,29 +312,16 @@ void fragmentMain() {
 
 /** The last bin with something in it before which more than half of the light passes: coarse, fine, what passes before. */
 export const pick = (fine) => ({
-  name: "pick", textures: [["bins0", "float2d"], ["bins1", "float2d"], ["bins2", "float2d"], ["bins3", "float2d"],
-    ...(fine ? [["picked", "float2d"]] : [])], outputs: ["rgba32float"],
+  name: "pick", textures: [["passing", "array"], ...(fine ? [["picked", "float2d"]] : [])], outputs: ["rgba32float"],
   fragment: `
 void fragmentMain() {
   ivec2 cell = ivec2(pixel);
-  vec4 shares = vec4(1.0);
   float passes = 1.0;
   float coarse = -1.0;
   ${fine ? "coarse = fetch(picked, cell, 0).x;\n  passes = fetch(picked, cell, 0).z;" : ""}
   vec4 found = vec4(coarse, -1.0, passes, 1.0);
   for (int bin = 0; bin < ${BINS}; bin++) {
-    if (bin == 0) {
-      shares = fetch(bins0, cell, 0);
-    }
-    if (bin == 4) {
-      shares = fetch(bins1, cell, 0);
-    }
-    if (bin == 8) {
-      shares = fetch(bins2, cell, 0);
-    }
-    if (bin == 12) {
-      shares = fetch(bins3, cell, 0);
-    }
+    vec4 shares = fetchLayer(passing, cell, bin / 4, 0);
     float share = shares[bin % 4];
     if (passes > 0.5 && share < 1.0) {
       found = vec4(${fine ? "coarse, float(bin)" : "float(bin), -1.0"}, passes, 1.0);

@@ -13,10 +13,10 @@ import sys
 from base64 import b64decode
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from engines.probes import Golden, Maps, prefiltered, shadow_maps
@@ -32,6 +32,9 @@ sys.path.insert(0, str(ENGINES / "shading"))
 import generate  # noqa: E402
 
 FloatArray = NDArray[np.float32]
+Program: TypeAlias = Callable[[FloatArray, int], FloatArray]
+"""A function of the harness, ready for a target: rows of float4, and a number of items, to a float4 an item."""
+
 AT = {"at": "float4 at(int index)"}
 TEXTURE_WIDTH = 2048
 
@@ -107,20 +110,13 @@ PAGE = """([source, width]) => {
 }"""
 
 
-@dataclass(frozen=True, eq=False)
-class Program:
-    """A function of the harness, made ready for a target: rows of float4 and a number of items to a float4 an item."""
-
-    name: str
-    run: Callable[[FloatArray, int], FloatArray]
-
-
 def missing(target: str) -> str | None:
     """Return what a target lacks on this machine, or None."""
     if generate.slangc() is None:
         return "slangc is not installed (PyPI: slangtorch)"
     if target == "glsl":
-        return None if CHROMIUM else "no chromium is installed (set BEAM_CHROMIUM)"
+        there = CHROMIUM and find_spec("playwright")
+        return None if there else "no chromium is installed (set BEAM_CHROMIUM), or no playwright"
     if target == "hlsl" and not shutil.which("glslangValidator"):
         return "glslangValidator is not installed (Debian: glslang-tools)"
     return None if device() is not None else "wgpu finds no adapter (PyPI: wgpu; Debian: mesa-vulkan-drivers)"
@@ -132,10 +128,8 @@ def device() -> Any:
     try:
         import wgpu
 
-        return wgpu.gpu.request_adapter_sync().request_device_sync(
-            required_limits={"max-storage-buffer-binding-size": 2**27}
-        )
-    except (ImportError, RuntimeError):
+        return wgpu.gpu.request_adapter_sync().request_device_sync()
+    except (ImportError, OSError, RuntimeError):
         return None
 
 
@@ -189,7 +183,7 @@ def vulkan_program(target: str, program: str, folder: Path) -> Program:
         device().queue.submit([encoder.finish()])
         return np.frombuffer(device().queue.read_buffer(made), np.float32).reshape(count, 4)
 
-    return Program(target, run_on)
+    return run_on
 
 
 @contextmanager
@@ -210,7 +204,7 @@ def program(target: str, function: str, folder: Path) -> Iterator[Program]:
             text = page.evaluate("run", count)
             return np.frombuffer(b64decode(text), np.float32).reshape(-1, 4)[:count]
 
-        yield Program(target, run_on)
+        yield run_on
 
 
 def packed(golden: Golden) -> FloatArray:

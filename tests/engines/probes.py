@@ -119,13 +119,8 @@ def _materials(
 
 
 PROBES = {"tripod": tripod, "spheres": spheres, "corner": corner, "figure": figure}
-EYES = {
-    "tripod": (0.65, -1.4, 0.95),
-    "spheres": (0.5, -2.0, 0.6),
-    "corner": (2.0, 1.8, 1.4),
-    "figure": (1.3, -2.6, 1.5),
-}
-FIELDS = {"tripod": 45.0, "spheres": 34.0, "corner": 45.0, "figure": 38.0}
+EYES = {"tripod": probe.EYE, "spheres": (0.5, -2.0, 0.6), "corner": (2.0, 1.8, 1.4), "figure": (1.3, -2.6, 1.5)}
+FIELDS = {"tripod": 36.0, "spheres": 34.0, "corner": 45.0, "figure": 38.0}
 TARGETS = {"tripod": probe.TARGET, "spheres": (0, 0, 0), "corner": (0.35, 0.35, 0.35), "figure": None}
 ENVIRONMENTS = ("studio", "sunset", "stage")
 LAMPS = ("point", "spot", "sun")
