@@ -22,9 +22,6 @@ PATH_SIZE = 1600, 900
 FLOOR_RAYS, FLOOR_OFFSET = 64, 1e-3
 """Rays of each disc of a mesh that find how open it is, and how far above it they begin [m]."""
 
-FINER_SHADOWS = 2
-"""Factor of the sides of shadow maps with a floor: it is among what casts shadows, so that maps look at more."""
-
 
 def staged_take(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str, EnvironmentMap]]:
     """Read a stage as one take.
@@ -60,7 +57,6 @@ def staged_take(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str,
     name = f"{path.stem} (stage)"
     turn = 0.0 if light is None else light.rotation_at(0.0)
     view: dict[str, Any] = {
-        "finerShadows": 1 if floor is None else FINER_SHADOWS,
         "state": {"environment": "none" if light is None else name, "rotation": (turn + 180.0) % 360.0 - 180.0},
         "degreesPerSecond": 0.0 if light is None else light.degrees_per_second,
         "lights": lights_to_json(stage.lights),

@@ -38,7 +38,7 @@ export async function start(root, settings) {
 export class Player {
   constructor(root, settings) {
     const {view = {}} = settings;
-    Object.assign(this, {root, settings, shadows: SHADOWS.map((size) => size * (view.finerShadows ?? 1)), scale: 0, lastMove: 0, environments: new Map()});
+    Object.assign(this, {root, settings, shadows: SHADOWS, scale: 0, lastMove: 0, environments: new Map()});
     this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: null, rotation: 0, exposure: 0, behind: false,
       transform: "standard", background: "#212121", path: Boolean(view.cameras), ...view.state};
     this.canvas = element("canvas", {tabIndex: 0, ariaLabel: "The take. Drag or use the arrow keys to orbit."});
