@@ -25,7 +25,7 @@ def wheel_names(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     source.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE", *FOLDERS):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "engines", *FOLDERS):
         (source / name).symlink_to(ROOT / name)
     subprocess.run(
         [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", folder, source],
@@ -53,7 +53,9 @@ def test_every_module_is_in_the_wheel(wheel_names, folder):
 def test_licence_and_files_that_are_no_modules_are_in_the_wheel(wheel_names):
     schema = {f"schema/{name}" for name in ("plugInfo.json", "generatedSchema.usda", "schema.usda", "SPEC.md")}
     typing, pages = {"py.typed", "__init__.pyi", "raster/__init__.pyi"}, {"study/page.js", "capture/page.js"}
-    assert {f"beam_warp/{name}" for name in schema | typing | pages} <= wheel_names
+    web = {f"web/{path.name}" for path in (ROOT / "engines" / "web").glob("*.*s")}
+    assert {"web/b4d.js", "web/player.js", "web/player.css"} <= web
+    assert {f"beam_warp/{name}" for name in schema | typing | pages | web} <= wheel_names
     assert any(name.endswith("/licenses/LICENSE") for name in wheel_names)
 
 

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +27,7 @@ from beam_warp.converters.frame_files import written_axes
 from beam_warp.converters.numbering import holds_a_frame, numbered_path
 from beam_warp.errors import InvalidOptionError
 from beam_warp.outputs import require_apart
-from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 READ = f"File ({', '.join(FORMATS)}), or a folder with asset.usda, meta.json or numbered files."
 """What is read, in words."""
@@ -43,7 +44,9 @@ class ConvertCommand:
 
     A folder of numbered files is a sequence, also if it is zipped; several frames written to walk.ply become
     walk000000.ply and so on. `beam-convert inspect FILE` says what a file holds; `beam-convert --version` prints the
-    version.
+    version. A stage (docs/stages.md) is read for --player only.
+
+    Example: beam-convert person/asset.usda person.html --player --environment studio.hdr
     """
 
     input: Annotated[Positional[Path], arg(metavar="IN", help=READ)]
@@ -79,6 +82,12 @@ class ConvertCommand:
         bool, arg(help="USD: add a variant whose radiance is the base colour, for renderers that light it.")
     ] = False
     error_scale: Annotated[float, arg(metavar="X", help="b4d: multiply the bounds of all errors.")] = 1.0
+    player: Annotated[bool, arg(help="Write a page, OUT.html, that plays the asset in any browser.")] = False
+    environment: Annotated[
+        tuple[Path, ...],
+        arg(metavar="FILE ...", help="Player: lat-long lights, .exr or .hdr, or folders of them; three are built in."),
+    ] = ()
+    beside: Annotated[bool, arg(help="Player: put the take beside the page, for servers, and not into it.")] = False
     quiet: Quiet = False
     json: Json = False
 
@@ -105,10 +114,8 @@ def _require_apart(source: Path, output: Path, frame_count: int) -> None:
         )
 
 
-def convert(command: ConvertCommand) -> int:
-    """Read, write, and say what was done."""
-    started = time.perf_counter()
-    options = converters.WriteOptions(
+def _options(command: ConvertCommand) -> converters.WriteOptions:
+    return converters.WriteOptions(
         target=command.target,
         axes=command.axes,
         profile=command.profile,
@@ -118,8 +125,10 @@ def convert(command: ConvertCommand) -> int:
         lighting_variants=command.lighting_variants,
         error_scale=command.error_scale,
     )
-    converters.require_output(command.output, options)
-    sequence = converters.read(
+
+
+def _read(command: ConvertCommand) -> GaussianSequence:
+    return converters.read(
         command.input,
         source_axes=command.source_axes,
         meters_per_unit=command.meters_per_unit,
@@ -127,11 +136,9 @@ def convert(command: ConvertCommand) -> int:
         activation=command.activation,
         drop_invalid=command.drop_invalid,
     )
-    form = format_of(command.output)
-    is_numbered = len(sequence) > 1 and not form.holds_sequences
-    if is_numbered:
-        _require_apart(command.input, command.output, len(sequence))
-    first = sequence[0]
+
+
+def _write(command: ConvertCommand, sequence: GaussianSequence, path: Path) -> list[Path]:
     with progress(command.quiet or command.json, compiles=False) as report:
 
         def read_and_report(frame: int) -> GaussianCloud:
@@ -139,7 +146,25 @@ def convert(command: ConvertCommand) -> int:
             report("convert", frame + 1, len(sequence))
             return cloud
 
-        paths = converters.write(dataclasses.replace(sequence, read_frame=read_and_report), command.output, options)
+        return converters.write(dataclasses.replace(sequence, read_frame=read_and_report), path, _options(command))
+
+
+def convert(command: ConvertCommand) -> int:
+    """Read, write, and say what was done."""
+    started = time.perf_counter()
+    options = _options(command)
+    if command.player:
+        from beam_warp.cli.player import publish  # its lights wait for SciPy
+
+        return publish(command, partial(_read, command), partial(_write, command))
+    converters.require_output(command.output, options)
+    sequence = _read(command)
+    form = format_of(command.output)
+    is_numbered = len(sequence) > 1 and not form.holds_sequences
+    if is_numbered:
+        _require_apart(command.input, command.output, len(sequence))
+    first = sequence[0]
+    paths = _write(command, sequence, command.output)
 
     notes = notes_of(sequence)
     if form.name == "splat" and (first.sh_degree or first.base_color is not None):

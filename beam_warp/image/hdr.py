@@ -1,4 +1,4 @@
-"""Reader of Radiance pictures (.hdr, RGBE), flat or in the old or new run-length encoding.
+"""Radiance pictures (.hdr, RGBE): reader, flat or in the old or new run-length encoding, and writer.
 
 Source: Ward 1991, "Real Pixels" (Graphics Gems II), and the Radiance file-format notes. Differences: a mantissa m
 decodes to m · 2^(e − 136) without Ward's half step, as in Blender, OpenImageIO and stb, so that every renderer sees
@@ -58,6 +58,20 @@ def read_radiance_hdr(path: Path, require_size: Callable[[Path, int, int], None]
         for row, rgbe in enumerate(_scanlines(path, data, start, height, width)):
             radiance[row] = rgbe[:, :3] * scale[rgbe[:, 3], None]
     return radiance[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
+
+
+def radiance_hdr(radiance: NDArray[np.float32]) -> bytes:
+    """Return a picture of linear RGB ``(H, W, 3)``, finite and not negative, flat.
+
+    A channel is off by at most half a step: 1/256 of the pixel's largest channel.
+    """
+    height, width = radiance.shape[:2]
+    largest = np.clip(radiance.max(axis=2), 0.0, np.ldexp(255.0, 119)).astype(np.float64)
+    exponent = np.maximum(np.frexp(largest)[1], -127)
+    mantissas = np.minimum(np.rint(np.ldexp(radiance.astype(np.float64), 8 - exponent[..., None])), 255)
+    is_black = (mantissas == 0).all(axis=2)
+    octets = np.concatenate([mantissas, np.where(is_black, 0, exponent + 128)[..., None]], axis=2).astype(np.uint8)
+    return b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (height, width) + octets.tobytes()
 
 
 def radiance_hdr_size(path: Path) -> tuple[int, int]:

@@ -743,16 +743,15 @@ fn srgbOf( value_0 : f32) -> f32
     }
     return _S57;
 }
+`;
 
+/** What fetches, WGSL; add it after `WGSL` and define the hooks. */
+export const WGSL_FETCHING = `
 // Display sRGB of light in [0, 1] (IEC 61966-2-1).
 fn linearToSrgb( color_4 : vec3<f32>) -> vec3<f32>
 {
     return vec3<f32>(srgbOf(color_4.x), srgbOf(color_4.y), srgbOf(color_4.z));
 }
-`;
-
-/** What fetches, WGSL; add it after `WGSL` and define the hooks. */
-export const WGSL_FETCHING = `
 
 // Bilinear radiance of a level of the environment, in its own axes; irradiance for level -1.
 fn levelRadiance( level_2 : i32,  d_3 : vec3<f32>) -> vec3<f32>
@@ -1712,12 +1711,6 @@ float srgbOf(float value_0)
     }
     return _S57;
 }
-
-// Display sRGB of light in [0, 1] (IEC 61966-2-1).
-vec3 linearToSrgb(vec3 color_4)
-{
-    return vec3(srgbOf(color_4.x), srgbOf(color_4.y), srgbOf(color_4.z));
-}
 `;
 
 /** What fetches, GLSL ES 3.00; add it after `GLSL` and define the hooks. */
@@ -1728,6 +1721,11 @@ int environmentRows(int level);
 vec3 environmentTexel(int level, ivec2 cell);
 vec2 albedoTexel(ivec2 cell);
 
+// Display sRGB of light in [0, 1] (IEC 61966-2-1).
+vec3 linearToSrgb(vec3 color_4)
+{
+    return vec3(srgbOf(color_4.x), srgbOf(color_4.y), srgbOf(color_4.z));
+}
 
 // Bilinear radiance of a level of the environment, in its own axes; irradiance for level -1.
 vec3 levelRadiance(int level_2, vec3 d_3)
