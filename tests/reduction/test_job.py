@@ -106,6 +106,7 @@ def test_a_refit_brings_images_closer_and_merging_beats_leaving_out(reducer):
     assert errors[0] > errors[1] > errors[2] + 3.0
 
 
+@pytest.mark.slow
 def test_the_same_call_gives_the_same_bits(reducer):
     again = Reducer(ball(), LIGHTS, QUICK)
     assert asset_digest(again.reduced(50)) == asset_digest(reducer.reduced(50))
