@@ -117,7 +117,7 @@ def ours(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
 
 def by_area(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
     """Return the Gaussians of the largest opacity times area, ties broken at random."""
-    jitter = 1.0 + 1e-6 * np.random.default_rng(0).random(len(cloud))
+    jitter = 1.0 + 1e-6 * np.random.default_rng(1).random(len(cloud))
     return kept(cloud.opacities * shown_area(cloud.scales) * jitter, cloud, count)
 
 
@@ -155,7 +155,8 @@ def decimated(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianClo
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "in.ply", Path(folder) / "out.ply"
         write(GaussianSequence.from_clouds([colored]), source)
-        command = [*npm_packages.splat_transform(), "-q", str(source), "--decimate-adaptive", str(count), str(target)]
+        program = [*npm_packages.splat_transform(), "-q", "-g", "cpu"]
+        command = [*program, str(source), "--decimate-adaptive", str(count), str(target)]
         subprocess.run(command, check=True, capture_output=True, timeout=600)
         found = change_axes(read(target)[0], "rfu")
     near = cKDTree(found.positions).query(cloud.positions)[1]
