@@ -118,8 +118,8 @@ def renamed(block: str, names: set[str]) -> str:
 
 def fetchers(source: str, hooks: Mapping[str, str]) -> set[str]:
     """Return the names of functions that call a hook, or one that does."""
-    found = set(hooks)
-    for each in re.split(r"(?m)^(?=\w+ \w+\([^)]*\)\n)", source)[1:]:
+    found, code = set(hooks), re.sub(r"//.*", "", source)
+    for each in re.split(r"(?m)^(?=\w+ \w+\([^)]*\)\n)", code)[1:]:
         if re.search(rf"\b(?:{'|'.join(found)})\(", each):
             found.add(each.split("(")[0].split()[1])
     return found - set(hooks)

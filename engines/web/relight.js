@@ -17,7 +17,7 @@ import * as passes from "./shaders.js";
 import {GLSL, GLSL_FETCHING, WGSL, WGSL_FETCHING} from "./shading.js";
 import {sorter} from "./sorting.js";
 
-const {ROW, ORDER, RADIANCE, CHANNELS, BINS} = passes;
+const {ROW, ORDER, RADIANCE, CHANNELS, BINS, SEARCHES} = passes;
 const isStored = (name) => name in ORDER || name in RADIANCE;
 const MAX_LAYERS = 256, LAYER_ROWS = 2048, KEPT_SEGMENTS = 3, RETRY_MS = 2000, THICKEST = 0.02;
 const SHADOW_FILTERS = [0.1, 0.01, 1, 0];
@@ -99,8 +99,8 @@ export class Relight extends EventTarget {
     if (this.#programs.depths) return;
     const program = (spec) => this.gpu.program(spec), {blendFormat} = this.gpu;
     Object.assign(this.#programs, {
-      depths: program(passes.depths(blendFormat)), bins: program(passes.bins(false)), fineBins: program(passes.bins(true)),
-      pick: program(passes.pick(false)), finePick: program(passes.pick(true)), median: program(passes.median(blendFormat)), texels: program(passes.texels),
+      depths: program(passes.depths(blendFormat)), bins: program(passes.bins(true)), fineBins: program(passes.bins(false)),
+      pick: program(passes.pick(true)), finePick: program(passes.pick(false)), median: program(passes.median(blendFormat)), texels: program(passes.texels),
     });
   }
 
@@ -429,19 +429,21 @@ export class Relight extends EventTarget {
     };
   }
 
-  /** Find median depths of a view: sums of depth times alpha, and of alpha. */
+  /** Find median depths of a view, in ever smaller ranges of the order of splats: sums of depth times alpha, and of alpha. */
   #median(view, order, filters, name) {
-    const {gpu} = this, p = this.#programs, {width, height} = view, size = Math.max(Math.ceil(this.#take.manifest.count / BINS), 1);
-    const splats = this.#splats(view, order, filters), uniforms = {...splats.uniforms, sizes: [size, Math.max(Math.ceil(size / BINS), 1), 0, 0]};
+    const {gpu} = this, p = this.#programs, {width, height} = view, splats = this.#splats(view, order, filters);
     const passing = this.#texture("passing", width, height, "rgba16float", BINS / 4), bins = [0, 1, 2, 3].map((k) => [passing, k]);
-    const [coarse, fine] = ["coarse", "fine"].map((each) => this.#texture(each, width, height, "rgba32float"));
-    const out = this.#texture(name, width, height, this.gpu.blendFormat);
-    const run = (program, targets, clear, picked) => gpu.draw(program, {...splats, uniforms, targets, clear, textures: {...splats.textures, picked}});
-    run(p.bins, bins, [1, 1, 1, 1]);
-    gpu.draw(p.pick, {targets: [coarse], textures: {passing}});
-    run(p.fineBins, bins, [1, 1, 1, 1], coarse);
-    gpu.draw(p.finePick, {targets: [fine], textures: {passing, picked: coarse}});
-    run(p.median, [out], [0, 0, 0, 0], fine);
+    const run = (program, targets, clear, uniforms, picked) =>
+      gpu.draw(program, {...splats, uniforms: {...splats.uniforms, ...uniforms}, targets, clear, textures: {...splats.textures, picked}});
+    let range = Math.max(this.#take.manifest.count, 1), picked = null;
+    for (let level = 0; level < SEARCHES; level++) {
+      const size = Math.ceil(range / BINS), uniforms = {sizes: [range, size, 0, 0]}, target = this.#texture(`picked${level % 2}`, width, height, "rgba32float");
+      run(picked ? p.fineBins : p.bins, bins, [1, 1, 1, 1], uniforms, picked);
+      gpu.draw(picked ? p.finePick : p.pick, {targets: [target], uniforms, textures: {passing, picked}});
+      [range, picked] = [size, target];
+    }
+    const out = this.#texture(name, width, height, gpu.blendFormat);
+    run(p.median, [out], [0, 0, 0, 0], {sizes: [range, 0, 0, 0]}, picked);
     return out;
   }
 

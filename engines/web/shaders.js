@@ -12,8 +12,8 @@ export const ROW = 1024;
 export const TERMS = 512;
 /** Most lamps, and most shadow maps of all lamps. */
 export const LAMPS = 16, MAPS = 24;
-/** Splats are divided into this many bins, and each bin into as many again, to find the median. */
-export const BINS = 16;
+/** To find the median, splats are divided into this many bins, the right bin into as many again, and so often. */
+export const BINS = 16, SEARCHES = 3;
 
 /** The same for captured colour: coefficients of spherical harmonics. */
 export const RADIANCE = Object.fromEntries(Array.from({length: 25}, (_, k) => [`radiance_${k}`, 3 * k]));
@@ -286,22 +286,29 @@ vec4 through(int bin, int first, float share) {
 }
 `;
 
-/** What passes each bin of splats, a product that needs no order; `fine` looks into the bin that was picked. */
-export const bins = (fine) => ({
-  name: fine ? "fine bins" : "bins", uniforms: [...VIEW, ["sizes"]], textures: [...CLOUD, ...(fine ? [["picked", "float2d"]] : [])],
+/** Whether a splat is in the range of ranks that was picked for this pixel; sizes are those of the range and of its bins. */
+const PICKED = `
+int localRank(float start) {
+  int local = rankHere() - int(start);
+  if (start < 0.0 || local >= int(u.sizes.x)) {
+    return -1;
+  }
+  return local;
+}
+`;
+
+/** What passes each bin of a range of splats, a product that needs no order; the first range is all of them. */
+export const bins = (first) => ({
+  name: first ? "bins" : "fine bins", uniforms: [...VIEW, ["sizes"]], textures: [...CLOUD, ...(first ? [] : [["picked", "float2d"]])],
   varyings: 3, outputs: Array(4).fill("rgba16float"), blend: "times", vertex: SPLAT(false),
-  fragment: `${SEEN}${RANK}
+  fragment: `${SEEN}${RANK}${PICKED}
 void fragmentMain() {
   float alpha = alphaHere();
-  int coarse = rankHere() / int(u.sizes.x);
-  int bin = coarse;
-  ${fine ? `bin = (rankHere() - coarse * int(u.sizes.x)) / int(u.sizes.y);
-  if (coarse != int(fetch(picked, ivec2(pixel), 0).x)) {
-    discard;
-  }` : ""}
-  if (alpha <= 0.0) {
+  int local = localRank(${first ? "0.0" : "fetch(picked, ivec2(pixel), 0).x"});
+  if (alpha <= 0.0 || local < 0) {
     discard;
   }
+  int bin = local / int(u.sizes.y);
   out0 = through(bin, 0, 1.0 - alpha);
   out1 = through(bin, 4, 1.0 - alpha);
   out2 = through(bin, 8, 1.0 - alpha);
@@ -310,21 +317,20 @@ void fragmentMain() {
 `,
 });
 
-/** The last bin with something in it before which more than half of the light passes: coarse, fine, what passes before. */
-export const pick = (fine) => ({
-  name: "pick", textures: [["passing", "array"], ...(fine ? [["picked", "float2d"]] : [])], outputs: ["rgba32float"],
+/** The last bin with something in it before which more than half of the light passes: its first rank, what passes before. */
+export const pick = (first) => ({
+  name: "pick", uniforms: [["sizes"]], textures: [["passing", "array"], ...(first ? [] : [["picked", "float2d"]])], outputs: ["rgba32float"],
   fragment: `
 void fragmentMain() {
   ivec2 cell = ivec2(pixel);
-  float passes = 1.0;
-  float coarse = -1.0;
-  ${fine ? "coarse = fetch(picked, cell, 0).x;\n  passes = fetch(picked, cell, 0).z;" : ""}
-  vec4 found = vec4(coarse, -1.0, passes, 1.0);
+  vec4 range = ${first ? "vec4(0.0, 1.0, 0.0, 0.0)" : "fetch(picked, cell, 0)"};
+  float passes = range.y;
+  vec4 found = vec4(-1.0, passes, 0.0, 0.0);
   for (int bin = 0; bin < ${BINS}; bin++) {
     vec4 shares = fetchLayer(passing, cell, bin / 4, 0);
     float share = shares[bin % 4];
     if (passes > 0.5 && share < 1.0) {
-      found = vec4(${fine ? "coarse, float(bin)" : "float(bin), -1.0"}, passes, 1.0);
+      found = vec4(range.x + float(bin) * u.sizes.y, passes, 0.0, 0.0);
     }
     passes = passes * share;
   }
@@ -337,13 +343,10 @@ void fragmentMain() {
 export const median = (format) => ({
   name: "median", uniforms: [...VIEW, ["sizes"]], textures: [...CLOUD, ["picked", "float2d"]], varyings: 3, outputs: [format],
   blend: "plus", vertex: SPLAT(false),
-  fragment: `${SEEN}${RANK}
+  fragment: `${SEEN}${RANK}${PICKED}
 void fragmentMain() {
   float alpha = alphaHere();
-  vec4 found = fetch(picked, ivec2(pixel), 0);
-  int coarse = rankHere() / int(u.sizes.x);
-  int bin = (rankHere() - coarse * int(u.sizes.x)) / int(u.sizes.y);
-  if (alpha <= 0.0 || coarse != int(found.x) || bin != int(found.y)) {
+  if (alpha <= 0.0 || localRank(fetch(picked, ivec2(pixel), 0).x) < 0) {
     discard;
   }
   out0 = vec4(depthHere() * alpha, alpha, 0.0, 0.0);
