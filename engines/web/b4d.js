@@ -8,8 +8,7 @@
 
 const MANIFEST = "manifest.json", HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26;
 const FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30, LARGEST = 1e6;
-const COMPONENTS = {positions: 3, orientations: 3, turns: 3, scales: 3, opacities: 1, base_color: 3, roughness: 1};
-Object.assign(COMPONENTS, {ambient_occlusion: 1, normals: 3});
+const COMPONENTS = {positions: 3, orientations: 3, turns: 3, scales: 3, opacities: 1, base_color: 3, roughness: 1, ambient_occlusion: 1, normals: 3};
 for (let k = 0; k < 25; k++) COMPONENTS[`radiance_${k}`] = 3;
 
 /** A container breaks its format; the message names the file in it. */
@@ -72,10 +71,9 @@ export class Take {
   }
 
   /** Open a `.b4d` file that is at hand: its bytes, or a Blob; a page needs no server for it. */
-  static async from(content) {
-    const blob = content instanceof Blob ? content : new Blob([content]);
-    const read = async (_, start, size) => new Uint8Array(await blob.slice(start, start + size).arrayBuffer());
-    return Take.open("bytes.b4d", read);
+  static from(content) {
+    const part = (start, size) => new Blob([content]).slice(start, start + size).arrayBuffer();
+    return Take.open("bytes.b4d", async (_, start, size) => new Uint8Array(await part(start, size)));
   }
 
   /** Return the arrays of a block, after one request; `entry` is `manifest.static` or one of `manifest.segments`. */
