@@ -36,7 +36,7 @@ from beam_warp.image.panels import lay_out
 from beam_warp.world.gaussians import GaussianSequence
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
-PAGE, PICTURE = (1120, 680), (640, 480)
+PAGE, PICTURE = (1120, 680), (400, 300)
 """Sizes of the page and of the stage's picture [pixel]."""
 
 BACKGROUND = 33

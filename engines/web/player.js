@@ -94,7 +94,9 @@ export class Player {
       this.take = take;
       this.settled = null;
       if (name) document.title = this.title.textContent = name;
-      this.box = !name && this.settings.view?.box ? boxOf(...this.settings.view.box) : boundsOf(take);
+      const box = name ? null : this.settings.view?.box;  // of a stage's assets, without its ground
+      this.box = box ? boxOf(...box) : boundsOf(take);
+      this.relight.casters = box ? {center: this.box.center, radius: 0.5 * this.box.extent} : null;
       this.lamps.place(this.box);
       if (!name) this.lamps.set((this.settings.view?.lights ?? []).map((light) => fromLight(light, this.box)));
       this.orbit.frame(this.box, this.free());

@@ -65,7 +65,7 @@ export class Relight extends EventTarget {
     require([undefined, "webgpu", "webgl2"].includes(backend), "backend must be webgpu or webgl2", backend);
     require(Number.isInteger(shadowMapSize) && shadowMapSize >= 16 && shadowMapSize <= 8192, "shadowMapSize must be in [16, 8192]", shadowMapSize);
     const relight = Object.assign(new Relight(), {canvas, shadowMapSize, rotation: 0, environmentGain: 1, exposure: 0, viewTransform: "standard",
-      channel: "relit", background: null, depthRange: null});
+      channel: "relit", background: null, depthRange: null, casters: null});
     relight.#environment = await Environment.constant();
     await relight.#start(async () => {
       if (backend !== "webgl2" && !context) {
@@ -389,13 +389,17 @@ export class Relight extends EventTarget {
     return this.#sorting;
   }
 
+  /** Return the sphere around what is most of the take. */
+  async #bulk(at) {
+    const {bulk: {center: [x, y, z], radius}} = await this.#sorter.ask({at, bulk: true});
+    return {center: [x, -z, y], radius};
+  }
+
   async #ask(view, key, mapsKey) {
     const {at} = this.#evaluated, take = this.#take, gpu = this.gpu;
     let mapViews = null;
     if (this.#lights.length && this.#maps.key !== mapsKey) {
-      const {bulk} = await this.#sorter.ask({at, bulk: true});
-      const [x, y, z] = bulk.center;
-      this.#casters = {center: [x, -z, y], radius: bulk.radius};
+      this.#casters = this.casters ?? await this.#bulk(at);
       mapViews = this.#lights.map((light) => shadowViews(light, this.#casters, this.shadowMapSize));
       require(mapViews.flat().length <= passes.MAPS, `shadow maps must be at most ${passes.MAPS}`, mapViews.flat().length);
     }
