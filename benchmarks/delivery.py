@@ -42,6 +42,7 @@ from beam_warp.converters.delivery.decoder import Container
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
+from beam_warp.evaluate.relit import loss_of
 from beam_warp.image.metrics import compare
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
@@ -52,9 +53,6 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.shot import Shot
 
 Row = dict[str, Any]
-
-ASSET_PSNR = 35.0
-"""PSNR of a good asset's relit images against the truth [dB]."""
 
 LIGHTS = ("studio", "sunset")
 SCRIPT = Path(__file__).with_name("decode_delivery.mjs")
@@ -110,7 +108,7 @@ def takes(bench: Bench) -> Iterator[Row]:
                     **sizes(path),
                     "errors": errors(clouds, back),
                     "relit_psnr": differences,
-                    "relit_loss_db": loss(min(differences.values())),
+                    "relit_loss_db": float(loss_of(min(differences.values()))),
                     "numpy_ms": numpy_ms(path, bench.repeats),
                     "node_ms": node_ms(path, bench.repeats),
                 }
@@ -143,11 +141,6 @@ def relit_psnr(images: dict[str, list[Any]], originals: dict[str, list[Any]]) ->
         )
         for light, found in images.items()
     }
-
-
-def loss(psnr: float) -> float:
-    """Return what an asset of `ASSET_PSNR` loses by errors of a PSNR that are independent of its own [dB]."""
-    return 10.0 * float(np.log10(1.0 + 10.0 ** ((ASSET_PSNR - psnr) / 10.0)))
 
 
 def sizes(path: Path) -> Row:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.errors import MissingPackageError
 from beam_warp.evaluate.perceptual import Measure, PerceptualMetrics
@@ -31,7 +31,7 @@ def compared_options(height: int) -> DeferredOptions:
     return DeferredOptions(environment_shadows=0, bounces=0, light_map_size=size, layers=())
 
 
-def loss_of(psnr: NDArray[np.float64]) -> NDArray[np.float64]:
+def loss_of(psnr: ArrayLike) -> NDArray[np.float64]:
     """Return what an asset of `ASSET_PSNR` loses against the truth by errors that are independent of its own [dB].
 
     Args:
