@@ -41,8 +41,8 @@ ORIENTATION_RAYS = 8
 SMOOTHING_PASSES = 3
 
 FACE_SPREAD = 0.2
-"""Standard deviation of normals within a face [rad]: axes of fitted Gaussians scatter by half of it, and across an edge
-of 30 degrees nothing counts."""
+"""Standard deviation of normals that belong to one face [rad]: axes of fitted Gaussians scatter by half of it, and an
+edge of 40 degrees lets next to nothing through."""
 
 FACE_PASSES = 2
 
@@ -226,7 +226,8 @@ def _face_normals(
     """Return normals of seen Gaussians that stay crisp at edges, ``(S,)`` vec3.
 
     What pixels see is a blend of the Gaussians in them, and spread back it is blended once more: edges are rounded
-    by two pixels. A flat Gaussian's own axis is not blended, but it is noisy; so it is averaged over the face.
+    by two pixels. A flat Gaussian's own axis is not blended, but it is noisy; so it is averaged over its face. Where
+    pixels agree with the face, to within the noise of the axes, there is no edge, and they know the normal better.
     """
     device = near.device
     own, flatness = _shortest_axes(cloud.select(rows))
@@ -239,7 +240,9 @@ def _face_normals(
     for _ in range(FACE_PASSES):
         launch_mean_of_face(len(current), places, current, weights, near, FACE_SPREAD, following, device)
         current, following = following, current
-    return current
+    faces = current.numpy()
+    agrees = (faces * blended).sum(axis=1) > np.cos(0.5 * FACE_SPREAD)
+    return upload(np.where(agrees[:, None], blended, faces), wp.vec3, device)
 
 
 def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
