@@ -20,19 +20,74 @@ from beam_warp.kernels.trace.wide_tree import WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
 
-BUFFER_SIZE = 16
-Times = wp.types.vector(length=BUFFER_SIZE, dtype=wp.float32)
-Indices = wp.types.vector(length=BUFFER_SIZE, dtype=wp.int32)
+BUFFER_SIZE = 32
+"""Hits of a round: most rays that meet a surface of overlapping Gaussians need one."""
+
+Hits = wp.types.vector(length=BUFFER_SIZE, dtype=wp.uint64)
 LAST = wp.constant(BUFFER_SIZE - 1)
 
 
 @wp.struct
 class HitBuffer:
-    """The nearest hits of a round in order; free places hold infinity."""
+    """The nearest hits of a round in order: the bits of t before the Gaussian's number, which sort like both."""
 
-    t: Times
-    index: Indices
+    hits: Hits
     count: int  # hits met, those that found no place included
+
+
+@wp.func_native(
+    """
+    union { float value; wp::uint32 bits; } time;
+    time.value = t;
+    const wp::uint64 hit = static_cast<wp::uint64>(time.bits) << 32 | static_cast<wp::uint32>(index);
+    int place = buffer.count < SIZE ? buffer.count : SIZE - 1;
+    ++buffer.count;
+    if (place == SIZE - 1 && buffer.count > SIZE && !(hit < buffer.hits[place]))
+        return;
+    while (place > 0 && hit < buffer.hits[place - 1]) {
+        buffer.hits[place] = buffer.hits[place - 1];
+        --place;
+    }
+    buffer.hits[place] = hit;
+""".replace("SIZE", str(BUFFER_SIZE))
+)
+def insert_hit(buffer: wp.ref[HitBuffer], t: float, index: int):
+    """Sink a hit of positive ``t`` to its place; the last one falls out of a full buffer."""
+    ...
+
+
+@wp.func_native("""
+    union { wp::uint32 bits; float value; } time;
+    time.bits = static_cast<wp::uint32>(buffer.hits[place] >> 32);
+    return time.value;
+""")
+def hit_time(buffer: wp.ref[HitBuffer], place: int) -> float:
+    """``t`` of a hit."""
+    ...
+
+
+@wp.func_native("return static_cast<int>(buffer.hits[place] & 0xffffffffu);")
+def hit_index(buffer: wp.ref[HitBuffer], place: int) -> int:
+    """Number of a hit's Gaussian."""
+    ...
+
+
+@wp.func
+def insert_leaf(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: wp.ref[HitBuffer], leaf: int
+):
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
+    if peak.alpha > 0.0 and is_before(ray.t_min, ray.index_min, peak.t, peak.index):
+        insert_hit(found, peak.t, peak.index)
+
+
+@wp.func
+def reach_of_buffer(ray: TracedRay, found: wp.ref[HitBuffer]) -> float:
+    """What lies behind a full buffer is passed over."""
+    reach = ray.t_max
+    if found.count >= BUFFER_SIZE:
+        reach = wp.min(reach, hit_time(found, LAST))
+    return reach
 
 
 @wp.func
@@ -40,51 +95,7 @@ def is_before(t: float, index: int, other_t: float, other_index: int) -> bool:
     return t < other_t or (t == other_t and index < other_index)
 
 
-@wp.func
-def insert_hit(buffer: HitBuffer, t: float, index: int) -> HitBuffer:
-    """Sink a hit to its place; the last one falls out. Unrolled, so that the buffer stays in registers."""
-    result = buffer
-    moving_t = t
-    moving_index = index
-    for k in range(BUFFER_SIZE):
-        if is_before(moving_t, moving_index, result.t[k], result.index[k]):
-            other_t = result.t[k]
-            other_index = result.index[k]
-            result.t[k] = moving_t
-            result.index[k] = moving_index
-            moving_t = other_t
-            moving_index = other_index
-    result.count += 1
-    return result
-
-
-@wp.func
-def empty_buffer() -> HitBuffer:
-    buffer = HitBuffer()
-    for k in range(BUFFER_SIZE):
-        buffer.t[k] = LARGEST_FLOAT
-        buffer.index[k] = 0x7FFFFFFF
-    return buffer
-
-
-@wp.func
-def insert_leaf(
-    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: HitBuffer, leaf: int
-) -> HitBuffer:
-    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
-    buffer = found
-    if peak.alpha > 0.0 and is_before(ray.t_min, ray.index_min, peak.t, peak.index):
-        buffer = insert_hit(found, peak.t, peak.index)
-    return buffer
-
-
-@wp.func
-def reach_of_buffer(ray: TracedRay, found: HitBuffer) -> float:
-    """What lies behind a full buffer is passed over."""
-    return wp.min(ray.t_max, found.t[LAST])
-
-
-insert_all = traversal("insert_all", insert_leaf, reach=reach_of_buffer, ordered=True)
+insert_all = traversal("insert_all", insert_leaf, reach=reach_of_buffer, ordered=True, in_place=True)
 
 
 @wp.func
@@ -102,7 +113,7 @@ def nearest_hits(
     ray = traced_ray(origin, direction, t_max)
     ray.t_min = t_last
     ray.index_min = index_last
-    return insert_all(tree, gaussians, settings, ray, empty_buffer())
+    return insert_all(tree, gaussians, settings, ray, HitBuffer())
 
 
 @wp.func
@@ -177,24 +188,26 @@ def trace_surface_kernel(
             occluders.tree, occluders.gaussians, settings, origin, direction, t_last, index_last, mesh.t
         )
         taken = wp.min(buffer.count, BUFFER_SIZE)
-        for k in range(BUFFER_SIZE):
-            if k < taken and transmittance >= settings.stop:
-                index = buffer.index[k]
-                peak = ray_peak(occluders.gaussians, index, origin, direction)
-                if peak.alpha > 0.0:  # at the support's edge leaf and packed rows may round to different sides
-                    weight = transmittance * peak.alpha
-                    opacity += weight
-                    depth += weight * buffer.t[k]
-                    normal += entry_normal(occluders.gaussians, index, origin, direction) * weight
-                    for channel in range(channels):
-                        out_records.attributes[i, channel] += weight * attributes[index, channel]
-                    transmittance *= 1.0 - peak.alpha
-                    hits += 1
-                    if threshold_gaussian < 0 and transmittance < threshold:
-                        threshold_gaussian = index
-                        threshold_depth = buffer.t[k]
-        t_last = buffer.t[LAST]
-        index_last = buffer.index[LAST]
+        k = int(0)
+        while k < taken and transmittance >= settings.stop:
+            t = hit_time(buffer, k)
+            index = hit_index(buffer, k)
+            peak = ray_peak(occluders.gaussians, index, origin, direction)
+            if peak.alpha > 0.0:  # at the support's edge leaf and packed rows may round to different sides
+                weight = transmittance * peak.alpha
+                opacity += weight
+                depth += weight * t
+                normal += entry_normal(occluders.gaussians, index, origin, direction) * weight
+                for channel in range(channels):
+                    out_records.attributes[i, channel] += weight * attributes[index, channel]
+                transmittance *= 1.0 - peak.alpha
+                hits += 1
+                if threshold_gaussian < 0 and transmittance < threshold:
+                    threshold_gaussian = index
+                    threshold_depth = t
+            k += 1
+        t_last = hit_time(buffer, LAST)
+        index_last = hit_index(buffer, LAST)
         more = 0
         # A full buffer may have hidden others from view.
         if buffer.count >= BUFFER_SIZE and transmittance >= settings.stop:
