@@ -77,8 +77,8 @@ class ArrivingLight:
         self._stale = {"regions": True, "lights": True}
 
     def order(self, positions: wp.array) -> None:
-        """Cluster Gaussians that are near each other; to be called once for every cloud."""
-        if self._count and self._options.bounces:
+        """Put Gaussians that are near each other side by side; to be called once for every cloud."""
+        if self._count and self._options.lights_gaussians:
             everybody = wp.full(self._count, 1, dtype=int, device=self._device)
             items, _ = morton_order(positions, positions, everybody)
             wp.copy(self._clusters.order, items, count=self._count)
@@ -199,7 +199,9 @@ class ArrivingLight:
         """Find the irradiance that reaches the Gaussians."""
         if not self._options.lights_gaussians or not self._count:
             return
-        launch_light_gaussians(gaussians, self.scene_light(), self._arriving, self._lit, self._device)
+        launch_light_gaussians(
+            self._clusters.order, gaussians, self.scene_light(), self._arriving, self._lit, self._device
+        )
         radiosity = self._bounced(gaussians) if self._options.bounces else self._no_radiosity
         launch_gather_bounces(
             len(gaussians.positions),

@@ -18,7 +18,7 @@ from beam_warp.kernels.common.lanes import (
 )
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
-from beam_warp.kernels.raster.bin_tiles import SIDE
+from beam_warp.kernels.raster.bin_tiles import SIDE, TileLists
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
@@ -60,6 +60,15 @@ def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, width: int, height:
     return 1
 
 
+@wp.func
+def listed_splat(lists: TileLists, place: int, end: int) -> int:
+    """The splat at a place of the lists; any where they end."""
+    splat = int(0)
+    if place < end:
+        splat = lists.splats[place]
+    return splat
+
+
 @cache
 def composite_cuda_kernel(channel_count: int, exact: bool):
     """Return the kernel that composites ``channel_count`` channels, an item a pixel."""
@@ -97,13 +106,17 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
         listed_range = frame.lists.ranges[listed]
         last = int(-1)
         begin = listed_range[0]
+        # What the lanes look at next is loaded while they composite: a list is as slow as its loads otherwise.
+        splat = listed_splat(frame.lists, begin + lane, listed_range[1])
+        following = listed_splat(frame.lists, begin + LANES + lane, listed_range[1])
+        center = wp.vec4()
+        shape = wp.vec4()
+        if begin < listed_range[1]:
+            center = load_row(frame.splats.centers, splat)
+            shape = load_row(frame.splats.shapes, splat)
         while begin < listed_range[1]:
-            mine = begin + lane
             wanted = int(0)
-            if mine < listed_range[1]:
-                splat = frame.lists.splats[mine]
-                center = load_row(frame.splats.centers, splat)
-                shape = load_row(frame.splats.shapes, splat)
+            if begin + lane < listed_range[1]:
                 wanted = reaches(center, shape, box.position, WIDTH, HEIGHT)
                 if wanted != 0:
                     share_row(1, CENTER, lane, center)
@@ -113,6 +126,10 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
                         share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
                     share_channels(1, lane, channels, splat)
             waiting = ballot(wanted)
+            splat = following
+            center = load_row(frame.splats.centers, splat)
+            shape = load_row(frame.splats.shapes, splat)
+            following = listed_splat(frame.lists, begin + 2 * LANES + lane, listed_range[1])
             wait_for_lanes()
             while waiting != 0:
                 bit = lowest_lane(waiting)
