@@ -9,7 +9,6 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.occluder import nearest_on_mesh
