@@ -20,7 +20,7 @@ from beam_warp.kernels.trace.wide_tree import WideTree, meet_leaf
 wp.set_module_options({"enable_backward": False})
 
 BUFFER_SIZE = 32
-"""Hits of a round: most rays that meet a surface of overlapping Gaussians need one."""
+"""Hits of a round: a surface of overlapping Gaussians stops a ray after about so many."""
 
 Hits = wp.types.vector(length=BUFFER_SIZE, dtype=wp.uint64)
 LAST = wp.constant(BUFFER_SIZE - 1)
