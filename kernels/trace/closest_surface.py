@@ -22,6 +22,9 @@ wp.set_module_options({"enable_backward": False})
 BUFFER_SIZE = 32
 """Hits of a round: a surface of overlapping Gaussians stops a ray after about so many."""
 
+HIT_THREADS = 64
+"""Threads of a block of the kernels that keep hits: each has a column of shared memory."""
+
 Hits = wp.types.vector(length=BUFFER_SIZE, dtype=wp.uint64)
 LAST = wp.constant(BUFFER_SIZE - 1)
 
@@ -30,45 +33,74 @@ LAST = wp.constant(BUFFER_SIZE - 1)
 class HitBuffer:
     """The nearest hits of a round in order: the bits of t before the Gaussian's number, which sort like both."""
 
-    hits: Hits
+    hits: Hits  # on the CPU; a kernel on CUDA keeps them in shared memory, of the buffer that it began last
     count: int  # hits met, those that found no place included
 
 
-@wp.func_native(
+_HITS = """
+#if defined(__CUDA_ARCH__)
+    __shared__ wp::uint64 kept[SIZE * THREADS];
+    wp::uint64* own = kept + threadIdx.x;
+    const int stride = THREADS;
+#else
+    wp::uint64* own = &buffer.hits[0];
+    const int stride = 1;
+#endif
+    if (!insert)
+        return own[place * stride];
+    if (buffer.count++ >= SIZE && hit >= own[(SIZE - 1) * stride])
+        return hit;
+    int to = wp::min(buffer.count, SIZE) - 1;
+    for (; to > 0 && hit < own[(to - 1) * stride]; --to)
+        own[to * stride] = own[(to - 1) * stride];
+    own[to * stride] = hit;
+    return hit;
+"""
+
+
+@wp.func_native(_HITS.replace("SIZE", str(BUFFER_SIZE)).replace("THREADS", str(HIT_THREADS)))
+def hits_of_thread(buffer: wp.ref[HitBuffer], insert: bool, hit: wp.uint64, place: int) -> wp.uint64:
+    """Sink a hit to its place in the buffer, where the last one falls out if it is full; or return the one at a place.
+
+    A thread's own array lies in CUDA's local memory, where threads that look at different places wait for each other.
+    In shared memory a place of every thread has a bank of its own.
     """
+    ...
+
+
+@wp.func_native("""
     union { float value; wp::uint32 bits; } time;
     time.value = t;
-    const wp::uint64 hit = static_cast<wp::uint64>(time.bits) << 32 | static_cast<wp::uint32>(index);
-    int place = buffer.count < SIZE ? buffer.count : SIZE - 1;
-    ++buffer.count;
-    if (place == SIZE - 1 && buffer.count > SIZE && !(hit < buffer.hits[place]))
-        return;
-    while (place > 0 && hit < buffer.hits[place - 1]) {
-        buffer.hits[place] = buffer.hits[place - 1];
-        --place;
-    }
-    buffer.hits[place] = hit;
-""".replace("SIZE", str(BUFFER_SIZE))
-)
-def insert_hit(buffer: wp.ref[HitBuffer], t: float, index: int):
-    """Sink a hit of positive ``t`` to its place; the last one falls out of a full buffer."""
+    return static_cast<wp::uint64>(time.bits) << 32 | static_cast<wp::uint32>(index);
+""")
+def packed_hit(t: float, index: int) -> wp.uint64:
+    """The number that a hit of positive ``t`` is sorted by."""
     ...
 
 
 @wp.func_native("""
     union { wp::uint32 bits; float value; } time;
-    time.bits = static_cast<wp::uint32>(buffer.hits[place] >> 32);
+    time.bits = static_cast<wp::uint32>(hit >> 32);
     return time.value;
 """)
+def time_of(hit: wp.uint64) -> float: ...
+
+
+@wp.func
+def insert_hit(buffer: wp.ref[HitBuffer], t: float, index: int):
+    hits_of_thread(buffer, True, packed_hit(t, index), 0)
+
+
+@wp.func
 def hit_time(buffer: wp.ref[HitBuffer], place: int) -> float:
     """``t`` of a hit."""
-    ...
+    return time_of(hits_of_thread(buffer, False, wp.uint64(0), place))
 
 
-@wp.func_native("return static_cast<int>(buffer.hits[place] & 0xffffffffu);")
+@wp.func
 def hit_index(buffer: wp.ref[HitBuffer], place: int) -> int:
     """Number of a hit's Gaussian."""
-    ...
+    return int(hits_of_thread(buffer, False, wp.uint64(0), place) & wp.uint64(0xFFFFFFFF))
 
 
 @wp.func
@@ -230,5 +262,5 @@ def trace_surface_kernel(
     out_records.mesh_faces[i] = mesh.face
 
 
-launch_trace_surface = launcher(trace_surface_kernel, block_dim=64)
+launch_trace_surface = launcher(trace_surface_kernel, block_dim=HIT_THREADS)
 """Trace one ray a thread, front to back."""
