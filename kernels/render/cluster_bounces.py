@@ -17,6 +17,7 @@ from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.light.brdf import specular_albedo
+from beam_warp.kernels.raster.splat_rows import quick_divide
 from beam_warp.kernels.render.gaussian_light import (
     ARRIVING,
     NORMAL,
@@ -29,6 +30,8 @@ from beam_warp.kernels.render.gaussian_light import (
 
 wp.set_module_options({"enable_backward": False})
 
+
+INVERSE_PI = wp.constant(1.0 / PI)
 
 MEAN_COSINE = wp.constant(0.6666667)
 """Mean cosine of cosine-weighted directions: the specular lobe's albedo there stands for that of diffuse light."""
@@ -148,7 +151,8 @@ def facing_radiosity(
         there = -wp.dot(away, first_three(load_row(clusters.sides, j)))
         if here > 0.0 and there > 0.0:
             squared = wp.dot(away, away)
-            factor = place[3] * here * there / (squared * (squared + place[3] / PI) + 1.0e-20)
+            area = place[3] * here * there
+            factor = quick_divide(area, squared * (squared + place[3] * INVERSE_PI) + 1.0e-20)
             total += factor * with_fourth(first_three(load_row(radiosity, j)), 1.0)
     return total
 
