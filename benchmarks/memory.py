@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import resource
 import tempfile
 import time
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import record
 import warp as wp
 
@@ -63,7 +63,7 @@ class Witness:
         """Note what is held after the materials of a frame."""
         if stage != "decompose" or done <= len(self.resident):
             return
-        self.resident.append(psutil.Process().memory_info().rss)
+        self.resident.append(resident_bytes())
         if self.device.is_cuda:
             wp.synchronize_device(self.device)
             self.allocated.append(wp.get_mempool_used_mem_current(self.device))
@@ -79,6 +79,11 @@ class Witness:
             **{name: growth(values) for name, values in found.items() if len(values) >= 4 * BLOCK},
             "samples": {name: values[:: max(len(values) // 200, 1)] for name, values in found.items()},
         }
+
+
+def resident_bytes() -> int:
+    """Return the memory of this process that is resident, on Linux [bytes]."""
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * resource.getpagesize()
 
 
 def growth(values: list[int]) -> dict[str, float]:
