@@ -1,6 +1,6 @@
 """What workers make of a take: ``beam run`` of 24 cameras of 1080p by one process, and by one on each GPU.
 
-    python benchmarks/workers.py [--quick] [--frames N --segment-length N --drawn N] [--workers WORD ...] --out result.json
+    python benchmarks/workers.py [--quick] [--frames N --segment-length N] [--workers WORD ...] --out result.json
 
 The take shows a few moments of `beam_warp.demo.capture` over and over. A first run of few small views compiles kernels.
 For each way of working: the seconds of each kind of step; the time before the first one, from the first one to the end

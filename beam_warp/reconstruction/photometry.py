@@ -32,9 +32,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.special import fdtri
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtri
 
 from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.capture.views import CapturedView

@@ -75,7 +75,7 @@ def here(plan):
 
 @pytest.mark.parametrize("is_still", [False, True])
 def test_clips_of_steps_have_the_bytes_of_one_call(tmp_path, is_still):
-    made, receipts, plan = written(tmp_path / "steps", is_still)
+    made, _, plan = written(tmp_path / "steps", is_still)
     converters.write(made.sequence(), tmp_path / "asset.usda")
     assert layers(tmp_path / "steps") == layers(tmp_path)
     assert len(layers(tmp_path)) == (2 if is_still else 6)
