@@ -82,8 +82,11 @@ def test_videos_give_the_views_of_images_decoded_from_them(filmed, tmp_path):
     assert films.frames_per_second == pytest.approx(RATE)
     assert [record.name for record in films.records] == [record.name for record in images.records]
     for ours, theirs in zip(films.records, images.records, strict=True):
-        assert np.array_equal(ours.view().color, theirs.view().color)
-        assert np.array_equal(ours.view().alpha, theirs.view().alpha)
+        assert np.array_equal(ours.photograph().rgb(), theirs.photograph().rgb())
+    for arrays in zip(
+        *(vars(record.view()).items() for record in (films.records[-1], images.records[-1])), strict=True
+    ):
+        assert arrays[0][0] in ("name", "camera") or np.array_equal(arrays[0][1], arrays[1][1]), arrays[0][0]
 
 
 @needs_ffmpeg
@@ -132,7 +135,7 @@ def test_what_is_no_video_is_refused(filmed, tmp_path):
 
 @needs_ffmpeg
 def test_high_dynamic_range_is_refused(filmed, tmp_path):
-    tags = ["-c:v", "libx264", "-color_trc", "smpte2084", "-color_primaries", "bt2020", "-colorspace", "bt2020nc"]
+    tags = ["-vf", "setparams=color_trc=smpte2084:color_primaries=bt2020:colorspace=bt2020nc"]
     subprocess.run([FFMPEG, "-loglevel", "error", "-i", filmed / "a.mp4", *tags, tmp_path / "x.mp4"], check=True)
     with pytest.raises(AssetFormatError, match="video must be of standard dynamic range"):
         film_of(tmp_path / "x.mp4")
