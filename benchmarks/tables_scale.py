@@ -11,31 +11,22 @@ SCALE = "scale_cpu.json"
 
 @table("scale_takes", SCALE)
 def takes(result: Row) -> Rows:
-    """Return hours and efficiency by GPUs and length of segments; the last two with the writing of the asset."""
-    rows: list[list[Any]] = [
-        [
-            "GPUs",
-            "frames of a segment",
-            "hours",
-            "efficiency",
-            "frames an hour a GPU",
-            "hours, written",
-            "efficiency, written",
-        ]
-    ]
-    for row in result["takes"]["rows"]:
-        rows.append(
+    """Return hours and efficiency by GPUs and length of segments; the last were one process to write the assets."""
+    head = ["GPUs", "frames of a segment", "hours", "efficiency", "frames an hour a GPU", "written by one process"]
+    return [
+        head,
+        *(
             [
                 f"{row['workers']:,}",
                 row["segment"],
                 cell(row["hours"], ".1f"),
                 f"{row['efficiency']:.0%}",
                 cell(row["frames_per_hour_a_worker"], ".0f"),
-                cell(row["hours"] + row["end_hours"], ".1f"),
-                f"{row['efficiency_with_end']:.0%}",
+                f"{cell(row['hours_written_by_one'], '.1f')} h, {row['efficiency_written_by_one']:.0%}",
             ]
-        )
-    return rows
+            for row in result["takes"]["rows"]
+        ),
+    ]
 
 
 @table("scale_check", SCALE)
