@@ -56,6 +56,9 @@ if __name__ == "__main__":
 
 MACHINES = 3
 
+PATHS = os.pathsep.join(filter(None, [str(record.ROOT / "tests"), os.environ.get("PYTHONPATH")]))
+"""Where drivers and workers find the steps."""
+
 
 @dataclass
 class Bench:
@@ -78,7 +81,6 @@ def outputs(folder: Path) -> dict[str, bytes]:
 def storm(bench: Bench, workers: str, kill: Callable[[random.Random, int], str]) -> Iterator[Row]:
     """Carry takes out until so many were killed, and compare each with one that nobody disturbed."""
     rng, killed, takes, executions, steps = random.Random(bench.seed), dict[str, int](), 0, 0, 0
-    paths = os.pathsep.join(filter(None, [str(record.ROOT / "tests"), os.environ.get("PYTHONPATH")]))
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         script = place / "driver.py"
@@ -90,7 +92,7 @@ def storm(bench: Bench, workers: str, kill: Callable[[random.Random, int], str])
             out.mkdir()
             while code != 0:
                 command = [sys.executable, "-P", str(script), str(out), workers, str(bench.nap)]
-                driver = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths})
+                driver = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": PATHS})
                 seen = begun(out)
                 while (code := driver.poll()) is None:
                     if (now := begun(out)) > seen:  # else nobody has begun anything that a kill could spoil
@@ -141,7 +143,7 @@ def cluster(bench: Bench) -> Iterator[Row]:
     """Kill machines of a Ray cluster, actors on them, or the driver."""
     from ray.cluster_utils import Cluster
 
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": str(record.ROOT / "tests")}
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": PATHS}
     os.chdir(tempfile.gettempdir())  # Ray's processes import from here first
     found = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     os.environ["RAY_ADDRESS"] = found.address
