@@ -44,7 +44,7 @@ WARM, BLOCK = 0.1, 20
 """Part of the frames that is left out at the start, and the number of blocks that the rest is parted into."""
 
 FEW = FromImagesOptions(
-    gaussian_count=GAUSSIANS, color_iterations=8, normal_iterations=8, joint_iterations=4, track_iterations=8
+    gaussian_count=GAUSSIANS, color_iterations=2, normal_iterations=2, joint_iterations=2, track_iterations=2
 )
 """Steps of a frame: enough to run through all code, for memory does not depend on their number."""
 
