@@ -136,7 +136,7 @@ def main() -> None:
         few = demo_steps(FromImagesOptions(gaussian_count=3000), device=device, seed=0)
         bench = Bench(4, 2, 96, 10, 8, few, device)
     else:
-        bench = Bench(12, 4, 320, 16, 64, FitAndTrack(fitting=FitOptions(gaussian_count=40_000), device=device), device)
+        bench = Bench(8, 2, 256, 16, 64, FitAndTrack(fitting=FitOptions(gaussian_count=20_000), device=device), device)
     keep = functools.partial(record.write_result, arguments, resolve_device(device))
     parts.measure({"flicker": flicker}, bench, keep=keep)
 

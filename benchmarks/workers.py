@@ -130,7 +130,7 @@ def take(bench: Bench) -> Iterator[Row]:
     began = time.perf_counter()
     capture = bench.capture("take", bench.cameras, bench.width, bench.height, bench.frames)
     bench.say(f"capture: {time.perf_counter() - began:.1f} s")
-    bench.run(bench.capture("warm", 8, 128, 128, bench.segment), "1", 2000)
+    bench.run(bench.capture("warm", 8, 128, 128, 2), "1", 2000)
     bench.say(f"warm: {time.perf_counter() - began:.1f} s")
     rows: list[Row] = []
     first: dict[str, bytes] = {}
