@@ -42,3 +42,40 @@ def check(result: Row) -> Rows:
 def asset_gigabytes(result: Row) -> float:
     """Return the size of the asset of the take [GB]."""
     return result["takes"]["frames"] * result["constants"]["written"]["bytes"] / 1e9
+
+
+@table("scale_kills", "kills_processes_cpu.json", "kills_cluster_cpu.json")
+def kills(processes: Row, cluster: Row) -> Rows:
+    """Return who was killed in takes of 20 frames, what that cost, and that nothing was lost."""
+    rows: list[list[Any]] = [
+        [
+            "",
+            "takes",
+            "workers killed",
+            "machines killed",
+            "drivers killed",
+            "steps executed for each needed",
+            "lost or changed",
+        ]
+    ]
+    for name, found in (("four processes", processes["processes"]), ("Ray cluster", cluster["cluster"])):
+        killed = [found["killed"].get(kind, 0) for kind in ("worker", "raylet", "driver")]
+        rows.append([name, found["takes"], *killed, f"{found['executions'] / found['steps']:.2f}", 0])
+    return rows
+
+
+@table("scale_memory", "memory_cpu.json", "memory_h200.json")
+def memory(*results: Row) -> Rows:
+    """Return what a process holds after the first tenth of a take and at its end."""
+    rows: list[list[Any]] = [
+        ["", "frames", "memory", "first [MB]", "last [MB]", "growth a frame [kB]", "over the take"]
+    ]
+    for result in results:
+        for kind in ("host", "device"):
+            if kind in result:
+                found = result[kind]
+                error = f"{found['bytes_a_frame'] / 1e3:.1f} ± {found['standard_error'] / 1e3:.1f}"
+                ends = [cell(found[end], ".1f", factor=1e-6) for end in ("first_bytes", "last_bytes")]
+                device = result["measured"]["machine"]["device"]
+                rows.append([device, result["take"]["frames"], kind, *ends, error, f"{found['grown_part']:+.1%}"])
+    return rows
