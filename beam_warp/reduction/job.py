@@ -197,7 +197,7 @@ class Reducer:
         lights = self.trials.draw("search", range(options.views, 3 * options.views), self._frames)
         how = {"raster": self.raster, "device": self._device, "progress": progress}
         self.sensitivity: Sensitivity = measure_sensitivity(original, self.trials, views, lights, **how)
-        self._order = MergeOrder(clouds, self.sensitivity)
+        self._order = MergeOrder(clouds, self.sensitivity, self._device)
 
     def __len__(self) -> int:
         """Return the number of Gaussians of the original."""
