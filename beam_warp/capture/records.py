@@ -39,7 +39,7 @@ ALPHA_ROUNDING = 2.0**-10
 COLOR_SPACES = {"srgb": DISPLAY_SRGB, "linear": LINEAR_REC709}
 """Values of ``color_space`` in a capture's files; without one, the convention of each image format holds."""
 
-DOUBT = "doubt"
+DOUBT = "coverage.doubt"
 """Channel of a photograph that says how much is not known of a pixel."""
 
 IMAGE_FOLDER = "images"
