@@ -381,6 +381,7 @@ MATERIALS = (
             ("FAR", "Step that is taken at a coarser level first [pixel of the level]."),
             ("WORST_ERROR", "Standard error from which silhouettes are asked [pixel]."),
             ("POOR", "Quality below which silhouettes are asked [dB]."),
+            ("UNMET", "Quality below which photographs are not of one subject [dB]."),
         )
     ),
     *(
@@ -539,7 +540,7 @@ UNTUNED = {
         beam_warp.reconstruction.hull: DISTANCE_LIMIT
         beam_warp.reconstruction.rig: FEWEST_CAMERAS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
         beam_warp.reconstruction.rig: SHORTEST_SIDE
-        beam_warp.reconstruction.alignment: NUMBERS
+        beam_warp.reconstruction.alignment: ENCODED_KNEE NUMBERS
         beam_warp.reconstruction.stereo: LEVELS SMALLEST_SIDE LEAST_PIXELS
         beam_warp.reconstruction.unmasked: PIXELS
         beam_warp.kernels.reconstruction.patch_match: STEP SIDE SAMPLES

@@ -40,6 +40,9 @@ ALPHA_ROUNDING = 2.0**-10
 COLOR_SPACES = {"srgb": DISPLAY_SRGB, "linear": LINEAR_REC709}
 """Values of ``color_space`` in a capture's files; without one, the convention of each image format holds."""
 
+DOUBT = "coverage.doubt"
+"""Channel of a photograph that says how much is not known of a pixel."""
+
 IMAGE_FOLDER = "images"
 MASK_FOLDER = "masks"
 """Folder of masks that are not named: ``masks/a/0.png``, or COLMAP's ``masks/a/0.jpg.png``, for ``images/a/0.jpg``."""
@@ -163,7 +166,15 @@ class CaptureRecord:
         color = rgba[..., :3]
         if self.gains != (1.0, 1.0, 1.0):
             color = color / np.array(self.gains, np.float32)
-        found = CapturedView(name=self.name, camera=self.camera, color=color, alpha=alpha, mask_offset=offset)
+        doubt = image.channels.get(DOUBT)
+        found = CapturedView(
+            name=self.name,
+            camera=self.camera,
+            color=color,
+            alpha=alpha,
+            doubt=doubt if doubt is not None and doubt.any() else None,
+            mask_offset=offset,
+        )
         return taken_in(found, self.mask_excess)
 
     def truth(self) -> Image:
@@ -222,7 +233,7 @@ class CaptureRecord:
             return (image if mask is None else _masked(_opaque(image), mask)), None  # as it is, and then refused
         start = keyed(scene, cast("NDArray[np.float32]", plate)) if mask is None else np.clip(mask, 0.0, 1.0)
         found = matte(scene, start, plate)
-        planes = dict(zip("RGBA", [*np.moveaxis(found.color, -1, 0), found.alpha], strict=True))
+        planes = dict(zip([*"RGBA", DOUBT], [*np.moveaxis(found.color, -1, 0), found.alpha, found.doubt], strict=True))
         cut = Image(image.path, planes, LINEAR_REC709, premultiplied=True)
         return cut, None if mask is None else found.offset
 
