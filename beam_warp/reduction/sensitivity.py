@@ -232,4 +232,3 @@ class _Meter:
 def material_rows(cloud: GaussianCloud) -> FloatArray:
     """Return the materials of Gaussians in the order of `COLUMNS`, ``(N, 8)``."""
     return np.concatenate([getattr(cloud, name).reshape(len(cloud), -1) for name in MATERIAL_CHANNELS], axis=1)
-

@@ -22,12 +22,7 @@ class Clusters:
 
 @wp.kernel
 def pair_costs_kernel(
-    first: int,
-    pairs: wp.array[wp.vec2i],
-    clusters: Clusters,
-    pixel: float,
-    spread: float,
-    out_costs: wp.array[float],
+    first: int, pairs: wp.array[wp.vec2i], clusters: Clusters, pixel: float, spread: float, out_costs: wp.array[float]
 ):
     """Cost of each pair, added over frames; ``spread`` is the cost of a distance along the surface over one across."""
     i = first + wp.tid()
