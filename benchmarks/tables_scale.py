@@ -69,3 +69,13 @@ def memory(result: Row) -> Rows:
         part = 1000.0 * 1e3 * slope / found["first_bytes"]
         rows.append([kind, result["take"]["frames"], *ends, f"{slope:.1f} ± {error:.1f}", f"{part:.1%}"])
     return rows
+
+
+@table("scale_seams", "seams_h200.json")
+def seams(result: Row) -> Rows:
+    """Return flicker of pairs of frames with a seam between them, of the same pairs without, and of all others."""
+    found, one = result["flicker"]["segments"], result["flicker"]["one"]
+    rows: list[list[Any]] = [["pairs of frames", "in segments", "in one segment"]]
+    for label, name in (("with a seam between them", "at_seams"), ("all others", "elsewhere")):
+        rows.append([label, cell(found[name], ".2f"), cell(one[name], ".2f")])
+    return rows
