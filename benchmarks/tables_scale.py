@@ -46,36 +46,36 @@ def asset_gigabytes(result: Row) -> float:
 
 @table("scale_kills", "kills_processes_cpu.json", "kills_cluster_cpu.json")
 def kills(processes: Row, cluster: Row) -> Rows:
-    """Return who was killed in takes of 20 frames, what that cost, and that nothing was lost."""
-    rows: list[list[Any]] = [
-        [
-            "",
-            "takes",
-            "workers killed",
-            "machines killed",
-            "drivers killed",
-            "steps executed for each needed",
-            "lost or changed",
-        ]
-    ]
-    for name, found in (("four processes", processes["processes"]), ("Ray cluster", cluster["cluster"])):
-        killed = [found["killed"].get(kind, 0) for kind in ("worker", "raylet", "driver")]
-        rows.append([name, found["takes"], *killed, f"{found['executions'] / found['steps']:.2f}", 0])
+    """Return how many were killed in takes of 20 frames that are whole, and what that cost."""
+    rows: list[list[Any]] = [["", "killed are", "kills", "takes", "executions of a step"]]
+    for name, who, found in (
+        ("three processes", "processes, drivers", processes["processes"]),
+        ("Ray cluster of three machines", "actors, machines, drivers", cluster["cluster"]),
+    ):
+        rows.append([name, who, found["kills"], found["takes"], f"{found['executions'] / found['steps']:.2f}"])
     return rows
 
 
-@table("scale_memory", "memory_cpu.json", "memory_h200.json")
-def memory(*results: Row) -> Rows:
+@table("scale_memory", "memory_h200.json")
+def memory(result: Row) -> Rows:
     """Return what a process holds after the first tenth of a take and at its end."""
     rows: list[list[Any]] = [
-        ["", "frames", "memory", "first [MB]", "last [MB]", "growth a frame [kB]", "over the take"]
+        ["memory", "frames", "first [MB]", "last [MB]", "growth a frame [kB]", "over 1,000 frames"]
     ]
-    for result in results:
-        for kind in ("host", "device"):
-            if kind in result:
-                found = result[kind]
-                error = f"{found['bytes_a_frame'] / 1e3:.1f} ± {found['standard_error'] / 1e3:.1f}"
-                ends = [cell(found[end], ".1f", factor=1e-6) for end in ("first_bytes", "last_bytes")]
-                device = result["measured"]["machine"]["device"]
-                rows.append([device, result["take"]["frames"], kind, *ends, error, f"{found['grown_part']:+.1%}"])
+    for kind in ("host", "device"):
+        found = result[kind]
+        slope, error = (round(found[name] / 1e3, 1) + 0.0 for name in ("bytes_a_frame", "standard_error"))
+        ends = [cell(found[end], ".1f", factor=1e-6) for end in ("first_bytes", "last_bytes")]
+        part = 1000.0 * 1e3 * slope / found["first_bytes"]
+        rows.append([kind, result["take"]["frames"], *ends, f"{slope:.1f} ± {error:.1f}", f"{part:.1%}"])
+    return rows
+
+
+@table("scale_seams", "seams_h200.json")
+def seams(result: Row) -> Rows:
+    """Return flicker of pairs of frames with a seam between them, of the same pairs without, and of all others."""
+    found, one = result["flicker"]["segments"], result["flicker"]["one"]
+    rows: list[list[Any]] = [["pairs of frames", "in segments", "in one segment"]]
+    for label, name in (("with a seam between them", "at_seams"), ("all others", "elsewhere")):
+        rows.append([label, cell(found[name], ".2f"), cell(one[name], ".2f")])
     return rows

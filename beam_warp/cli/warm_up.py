@@ -79,10 +79,9 @@ def _work(folder: Path, device: str) -> None:
     )
     assert capture.environment_path is not None
     light = EnvironmentMap.read(capture.environment_path)
-    few = {"gaussian_count": 1000, "color_iterations": 12, "normal_iterations": 12, "refine_every": 6}
     usual = TrackOptions()
     steps = FitAndTrack(
-        fitting=FitOptions(**few),
+        fitting=FitOptions(gaussian_count=1000, color_iterations=12, normal_iterations=12, refine_every=6),
         tracking=TrackOptions(refinement=FitOptions(**{**vars(usual.refinement), "normal_iterations": 6})),
         environment=light,
         device=device,
