@@ -366,7 +366,7 @@ def _sharpened(coverage: NDArray[np.floating]) -> NDArray[np.float64]:
 def _believed(
     excess: NDArray[np.float64], error: NDArray[np.float64]
 ) -> tuple[MaskOffset | None, float, NDArray[np.float64]]:
-    """Return the offset of a mask, by how much to take all of it in, and each point beside that: what is beyond doubt."""
+    """Return a mask's offset, by how much to take it in, and each point beside that: what is beyond doubt."""
     weights = 1.0 / error**2
     middle = _median(excess, weights)
     spread = max(1.4826 * _median(np.abs(excess - middle), weights), _median(error, weights))

@@ -104,7 +104,7 @@ def launch_add_sample_gradients(
 
 
 def launch_believe(doubt: Any, known: Any, out_values: Any, device: Any) -> None:
-    """Make values ``(H, W, C)`` as much like those of a target, 0 without, as a pixel is in doubt; stay without doubt."""
+    """Bring values ``(H, W, C)`` as near to those known, 0 without, as pixels are in doubt; none are without."""
     if doubt is not None:
         launch(believe_kernel, doubt.size, inputs=[doubt, known], outputs=[out_values], device=device)
 
