@@ -61,7 +61,7 @@ def arriving_radiance(
     return diffuse + reflected_radiance(environment.light, normal, view, roughness) * (reflected * open_share)
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=96)  # by itself it takes 211, and few threads fit: a sixth slower with two lights
 def shade_gaussians_kernel(
     first: int,
     views: wp.array[RasterView],
