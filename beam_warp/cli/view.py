@@ -81,7 +81,7 @@ def view(args: ViewCommand) -> int:
         raise InvalidOptionError("open must be given once, got --open and --no-open. Leave one out.")
     require_count("longest", args.longest, 64, 8192)
     lights = environments(args.environment)
-    sequence, parts = _shown(args, lights)
+    sequence, parts = shown(args, lights)
 
     from beam_warp.view.viewer import Viewer, ViewOptions
 
@@ -100,8 +100,8 @@ def view(args: ViewCommand) -> int:
     return 0
 
 
-def _shown(args: ViewCommand, lights: Lights) -> tuple[GaussianSequence, dict[str, Any]]:
-    """Return what is shown, and what the viewer is told besides."""
+def shown(args: ViewCommand, lights: Lights) -> tuple[GaussianSequence, dict[str, Any]]:
+    """Return what is shown, and what else `beam_warp.view.viewer.Viewer` is told."""
     if is_stage(args.asset):
         if args.reading != ReadingFlags():
             raise InvalidOptionError("a stage must state how its assets are read, got options for it. Leave them out.")
@@ -135,9 +135,9 @@ def _staged(path: Path, lights: Lights) -> tuple[GaussianSequence, dict[str, Any
     from beam_warp.stage.takes import staged_take
     from beam_warp.view.viewer import Staging
 
-    shown = Stage.read(path)
-    sequence, view, own = staged_take(shown, title_of(path))
-    staging = Staging(view=view, cloud=lambda frame: shown.cloud_at(shown.time_of(frame)), mesh=shown.mesh)
+    found = Stage.read(path)
+    sequence, view, own = staged_take(found, title_of(path))
+    staging = Staging(view=view, cloud=lambda frame: found.cloud_at(found.time_of(frame)), mesh=found.mesh)
     return sequence, {
         "environments": {**{name: partial(own.__getitem__, name) for name in own}, **lights},
         "staging": staging,

@@ -131,7 +131,7 @@ class _Handler(BaseHTTPRequestHandler):
                 return self._say(404, "Not found")
             size = found.size
             start, stop, is_part = self._range(size)
-            if start > stop:
+            if is_part and start >= stop:
                 return self._say(416, f"The range must begin within {size} bytes")
             parts = found.parts(start, stop)
             first = next(parts, b"")  # what cannot be read is said before anything is sent
