@@ -1,7 +1,7 @@
 """Draw docs/images/player.jpg, player_stage.jpg and viewer.jpg: the player page, a stage by two renderers, a still.
 
 The take is that of `delivery.py`: the demo's figure, which dances. The page is drawn by a headless Chromium,
-in software. The stage is drawn by ``beam render`` and by the page, from the same file. The still is that of ``beam view``.
+in software. The stage is drawn by ``beam render`` and by the page, from the same file. The still is ``beam view``'s.
 
     python benchmarks/player.py [--gaussians 30000] [--frames 12] [--only viewer]
 """

@@ -137,14 +137,16 @@ class Stills:
                 line, layers = self._channel(kind, self._cloud(frame), camera, asked)
             yield line | self._named(layers)
             return
-        writer = PictureWriter(_options(asked))
+        options = _options(asked)
+        kept = "environment" if options.background == "environment" else "transparent"
+        writer, exact = PictureWriter(options), PictureWriter(PictureOptions(background=kept))
         samples = require_count("samples", asked["samples"], 1, MOST_PATHS)
         with self._lock:
             shot = self._shot(frame, camera, asked)
         for image, done, total in self._traced(shot, samples) if kind == TRACED else self._shaded(shot):
             line = {"png": _png(writer.pixels(shot, image)), "samples": done, "of": total}
             is_last = done == total
-            yield line | (self._named(lambda image=image: writer.exr_layers(shot, image)) if is_last else {})
+            yield line | (self._named(lambda image=image: exact.exr_layers(shot, image)) if is_last else {})
 
     def _traced(self, shot: Shot, samples: int) -> Iterator[tuple[RenderedImage, int, int]]:
         """Yield an image, its paths a pixel, and how many there will be."""

@@ -248,7 +248,7 @@ export class Player {
     if (this.isFollowing || this.part === frame) return;
     this.isFollowing = true;
     try {
-      const take = await Take.open(parts.url.replace("/0.", `/${frame}.`));
+      const take = await Take.open(parts.url.replace(/0(?=\.b4d$)/, frame));
       if (this.parts !== parts) return;
       await this.relight.open(take);
       this.take = take;

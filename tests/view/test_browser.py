@@ -86,9 +86,12 @@ def opened(browser):
     assert wrong == []
 
 
+MOVING = GaussianSequence(FRAMES, read, frames_per_second=10.0, topology="constant")
+
+
 @pytest.fixture
 def page(opened):
-    return opened(GaussianSequence(FRAMES, read, frames_per_second=10.0, topology="constant"))
+    return opened(MOVING)
 
 
 def agree(page, cloud):
@@ -113,9 +116,10 @@ def test_frames_with_nothing_in_common_are_shown_one_by_one(opened):
     until(page, "player.part === 1")
 
 
-def test_a_lost_frame_holds_the_last_one_and_comes_back(page):
+def test_a_lost_frame_holds_the_last_one_and_comes_back(opened):
     LOST.add(FRAMES - 1)
     try:
+        page = opened(MOVING)
         held = picture(page)
         page.evaluate("player.change({time: 0.65})")
         words = said(page)
@@ -178,7 +182,7 @@ def test_errors_of_an_asset_are_stills_with_a_legend(page):
 
 def test_a_stage_stands_on_its_ground(opened, tmp_path):
     converters.write(GaussianSequence.from_clouds([ball(0)]), tmp_path / "a.usda")
-    content = {"beam-stage": 1, "assets": ["a.usda"], "meshes": [{"ground": True, "size": 3}]}
+    content = {"beam-stage": 1, "assets": ["a.usda"], "meshes": [{"ground": True, "size": 8}]}
     content |= {"camera": {"type": "fixed", "position": [0, -4, 1], "target": [0, 0, 0], "fov": 40}}
     (tmp_path / "set.json").write_text(json.dumps(content | {"environment": {"radiance": [1, 1, 1]}}))
     sequence, parts = shown(ViewCommand(asset=tmp_path / "set.json"), {})

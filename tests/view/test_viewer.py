@@ -2,7 +2,9 @@
 
 import base64
 import json
+import shutil
 import socket
+import subprocess
 import threading
 import urllib.error
 import urllib.request
@@ -11,6 +13,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from email.message import Message
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,6 +37,8 @@ from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.lights import PointLight, lights_to_json
 from beam_warp.world.shot import Shot
 
+NODE = shutil.which("node")
+WEB = Path(__file__).parents[2] / "engines" / "web"
 FRAMES = SEGMENT_FRAMES + 2
 LIGHTS = {"white": lambda: EnvironmentMap.constant([1.0, 1.0, 1.0], height=4)}
 CAMERA = Camera.orbit((0, 0, 0), 3.0, 30.0, 20.0, width=24, height=20, vertical_fov=25.0)
@@ -206,6 +211,21 @@ def test_segments_made_on_demand_are_those_of_the_container(viewer, tmp_path, mo
         assert ask(viewer, name)[0] == 404
 
 
+@pytest.mark.skipif(NODE is None, reason="there is no node")
+def test_a_player_reads_it_over_the_wire(viewer):
+    script = f"""
+        import {{Take}} from {json.dumps((WEB / "b4d.js").as_uri())};
+        const take = await Take.open({json.dumps(viewer.url + "manifest.json")});
+        const {{positions}} = await take.frame({FRAMES - 1});
+        console.log(JSON.stringify([take.manifest.count, positions.subarray(0, 400).reduce((a, b) => a + b) / 400]));"""
+    done = subprocess.run(
+        [NODE, "--input-type=module", "-e", script], capture_output=True, text=True, timeout=60, check=True
+    )
+    count, middle = json.loads(done.stdout)
+    assert count == 400
+    assert middle == pytest.approx(ball(FRAMES - 1).positions[:, 0].mean(), abs=0.01)
+
+
 def test_a_file_is_read_in_ranges_and_may_be_lost(tmp_path):
     path = tmp_path / "ball.b4d"
     converters.write(moving(2), path)
@@ -304,7 +324,9 @@ def test_a_still_is_the_path_tracers_image_and_comes_step_by_step(viewer, tmp_pa
     shown = display_over(image.rgb, image.alpha, background=np.full(3, 33 / 255.0))
     np.testing.assert_allclose(pixels(lines[-1]["png"]).astype(int), shown, atol=1)
     (tmp_path / "still.exr").write_bytes(ask(viewer, lines[-1]["exr"])[1])
-    assert read_image(tmp_path / "still.exr").rgb().shape == (20, 24, 3)
+    kept = read_image(tmp_path / "still.exr")
+    np.testing.assert_allclose(kept.alpha, image.alpha, atol=1e-6)
+    np.testing.assert_allclose(kept.rgb(), image.rgb, atol=1e-5)
     still(viewer, samples=1)
     assert ask(viewer, lines[-1]["exr"])[0] == 404
 
