@@ -115,7 +115,7 @@ def still_of_viewer(browser: Any, asset: Path) -> NDArray[np.uint8]:
         page.evaluate(
             "document.querySelectorAll('aside details').forEach((each, k) => { each.open = [1, 3].includes(k); })"
         )
-        page.get_by_label("Ground").select_option("grey")
+        page.evaluate("player.stills.ground.value = 'grey'")
         page.get_by_label("Samples").fill(str(STILL_SAMPLES))
         page.get_by_role("button", name="Draw still").click()
         settled(page, "player.stills.isShown && !player.stills.isDrawing")

@@ -30,6 +30,9 @@ HELD_BYTES, HELD_LEAST = 2**29, 16
 FILE = "take.b4d"
 """Name of a take that is a file."""
 
+_UNKNOWN = {"offset": 0, "bytes": 1, "unpacked": 4, "sha256": ""}
+"""What a manifest says of a block that is not made yet: the least there is, for players that check."""
+
 Made = TypeVar("Made")
 
 
@@ -142,6 +145,7 @@ class SegmentedTake:
                 "frames": min(SEGMENT_FRAMES, count - first),
                 "file": f"{name}.bin",
                 "described": f"{name}.json",
+                **_UNKNOWN,
             }
             for first, name in zip(range(0, count, SEGMENT_FRAMES), self._names, strict=True)
         ]

@@ -28,10 +28,7 @@ function rangesOf(url) {
   return async (name, start, size) => {
     const place = name === null ? url : new URL(name, new URL(url, globalThis.location?.href));
     const answer = await fetch(place, {headers: {Range: `bytes=${start}-${start + size - 1}`}});
-    if (!answer.ok) {
-      const isSaid = answer.headers.get("Content-Type")?.startsWith("text/plain"), words = isSaid ? `: ${(await answer.text()).slice(0, 300)}` : "";
-      throw new DeliveryError(`${name ?? url} must be within reach, got ${answer.status}${words}`);
-    }
+    require(answer.ok, `${name ?? url} must be within reach`, answer.status);
     const content = new Uint8Array(await answer.arrayBuffer());
     return answer.status === 206 ? content : content.subarray(start, start + size);
   };
@@ -81,7 +78,6 @@ export class Take {
 
   /** Return the arrays of a block, after one request; `entry` is `manifest.static` or one of `manifest.segments`. */
   async tracks(entry, frames) {
-    if (entry.described) entry = {...entry, ...described(await this.read(entry.described, 0, HEAD_BYTES), entry.described)};
     const [name, start] = this.isArchive ? [null, this.start + entry.offset] : [entry.file, 0];
     const packed = await this.read(name, start, entry.bytes);
     require(packed.length === entry.bytes, `${entry.file} must have ${entry.bytes} bytes`, packed.length);
@@ -117,8 +113,9 @@ function check(said) {
   require(said?.format === "b4d" && said.version === 1, "version must be 1 of b4d", said?.version);
   require(said.static && Array.isArray(said.segments), "static and segments must be there", said.segments);
   for (const entry of [said.static, ...said.segments]) {
-    for (const name of [entry?.file, entry?.described ?? "-"]) require(/^[\w-][\w.-]{0,200}$/.test(name), "blocks must say their file, a name beside the manifest", name);
-    if (!entry.described) checkBlock(entry);
+    require(/^[\w-][\w.-]{0,200}$/.test(entry?.file), "blocks must say their file, a name beside the manifest", entry?.file);
+    whole(entry.offset, "offset", 0, 2 ** 53 - 1);
+    whole(entry.unpacked, "unpacked", 4, Math.min(FREE_BYTES + MAX_RATIO * whole(entry.bytes, "bytes", 1, 2 ** 40), 2 ** 31));
   }
   whole(said.count, "count", 0, FREE_COUNT + said.static.bytes);
   let following = 0;
@@ -126,22 +123,6 @@ function check(said) {
     following = whole(first, "first", following, following) + whole(frames, "frames", 1, MAX_FRAMES);
   }
   whole(said.frames, "frames", Math.max(following, 1), following);
-}
-
-function checkBlock(entry) {
-  whole(entry.offset, "offset", 0, 2 ** 53 - 1);
-  whole(entry.unpacked, "unpacked", 4, Math.min(FREE_BYTES + MAX_RATIO * whole(entry.bytes, "bytes", 1, 2 ** 40), 2 ** 31));
-}
-
-/** Return what a server says of a block that it has made on demand, instead of the manifest. */
-function described(content, name) {
-  try {
-    const {offset, bytes, unpacked, sha256} = JSON.parse(new TextDecoder().decode(content));
-    checkBlock({offset, bytes, unpacked});
-    return {offset, bytes, unpacked, sha256};
-  } catch (error) {
-    throw error instanceof DeliveryError ? error : new DeliveryError(`${name} must be JSON, got ${error.message}.`);
-  }
 }
 
 async function inflated(packed, entry) {

@@ -6,6 +6,7 @@ import {Take} from "./b4d.js";
 import {download, element} from "./elements.js";
 import {Environment} from "./environment.js";
 import {Lamps, fromLight} from "./lamps.js";
+import {openLive} from "./live.js";
 import {Orbit, boundsOf, boxOf} from "./orbit.js";
 import {Relight} from "./relight.js";
 import {Stills} from "./stills.js";
@@ -91,7 +92,7 @@ export class Player {
   async open(source, name) {
     this.busy(true);
     try {
-      const take = await (source instanceof Blob ? Take.from(source) : Take.open(source.url, source.read));
+      const take = await (source instanceof Blob ? Take.from(source) : this.settings.stills ? openLive(source.url) : Take.open(source.url, source.read));
       await this.relight.open(take);
       this.take = take;
       this.settled = null;
@@ -248,7 +249,7 @@ export class Player {
     if (this.isFollowing || this.part === frame) return;
     this.isFollowing = true;
     try {
-      const take = await Take.open(parts.url.replace(/0(?=\.b4d$)/, frame));
+      const take = await openLive(parts.url.replace(/0(?=\.b4d$)/, frame));
       if (this.parts !== parts) return;
       await this.relight.open(take);
       this.take = take;

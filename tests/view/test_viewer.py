@@ -214,8 +214,8 @@ def test_segments_made_on_demand_are_those_of_the_container(viewer, tmp_path, mo
 @pytest.mark.skipif(NODE is None, reason="there is no node")
 def test_a_player_reads_it_over_the_wire(viewer):
     script = f"""
-        import {{Take}} from {json.dumps((WEB / "b4d.js").as_uri())};
-        const take = await Take.open({json.dumps(viewer.url + "manifest.json")});
+        import {{openLive}} from {json.dumps((WEB / "live.js").as_uri())};
+        const take = await openLive({json.dumps(viewer.url + "manifest.json")});
         const {{positions}} = await take.frame({FRAMES - 1});
         console.log(JSON.stringify([take.manifest.count, positions.subarray(0, 400).reduce((a, b) => a + b) / 400]));"""
     done = subprocess.run(
