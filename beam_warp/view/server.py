@@ -6,7 +6,7 @@ import json
 import os
 import re
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -72,7 +72,7 @@ class PageServer(ThreadingHTTPServer):
     allow_reuse_address = os.name != "nt"  # there it would share a port that is taken
 
     def __init__(
-        self, host: str, port: int, find: Callable[[str], Content | None], work: Callable[[Any], Iterator[Any]]
+        self, host: str, port: int, find: Callable[[str], Content | None], work: Callable[[Any], Generator[Any]]
     ) -> None:
         """Listen; nothing is answered before ``serve_forever``.
 

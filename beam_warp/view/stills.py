@@ -196,7 +196,8 @@ class Stills:
         pose = np.eye(4)
         pose[:3, :3] = np.reshape(np.asarray(given["worldToCamera"], np.float64), (3, 3)).T
         pose[:3, 3] = given["position"]
-        return Camera(width, height, *given["focal"], *given["center"], pose)
+        (focal_x, focal_y), (center_x, center_y) = given["focal"], given["center"]
+        return Camera(width, height, focal_x, focal_y, center_x, center_y, pose)
 
     def _named(self, layers: Callable[[], Mapping[str, NDArray[np.float32]]]) -> dict[str, str]:
         """Keep the numbers of a still that is done, in place of the last one's."""
@@ -210,9 +211,10 @@ def _options(asked: Any) -> PictureOptions:
     behind = asked["background"]
     if behind != "environment":
         try:
-            behind = tuple(octet / 255.0 for octet in bytes.fromhex(behind.removeprefix("#")))
+            red, green, blue = bytes.fromhex(behind.removeprefix("#"))
         except ValueError:
             raise InvalidOptionError(f"background must be a colour such as #212121, got {behind!r:.40}.") from None
+        behind = red / 255.0, green / 255.0, blue / 255.0
     return PictureOptions(view=asked["transform"], exposure=asked["exposure"], background=behind)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -181,7 +181,7 @@ class Viewer:
         )
         return Stills(subject, longest=self._options.longest, device=self._options.device, lock=self._device)
 
-    def _draw(self, asked: Any) -> Iterator[dict[str, Any]]:
+    def _draw(self, asked: Any) -> Generator[dict[str, Any]]:
         try:
             with self._device:
                 stills = self._stills

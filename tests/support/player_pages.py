@@ -51,7 +51,9 @@ def said(page):
 
 def camera_of(page, scale=1.0):
     """The camera that a page looks through."""
-    given = page.evaluate(f"player.camera(...[player.canvas.width, player.canvas.height].map((n) => {scale} * n))")
+    given = page.evaluate(
+        f"player.camera(...[player.root.clientWidth, player.root.clientHeight].map((n) => {scale} * n))"
+    )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.reshape(given["worldToCamera"], (3, 3)).T, given["position"]
     return Camera(int(given["width"]), int(given["height"]), *given["focal"], *given["center"], pose)
