@@ -72,6 +72,7 @@ export class Player {
 
   async makeCore(backend = this.settings.backend) {
     this.relight = await Relight.create(this.canvas, backend ? {backend} : {});
+    this.relight.environment = await Environment.constant([0.5, 0.5, 0.5]); // until the first one has been blurred
     const on = (name, act) => this.relight.addEventListener(name, ({detail}) => act(detail));
     on("lost", ({message}) => this.say(`The graphics device was lost, and the picture stands still (${message}).`, true, "Start again",
       () => location.reload()));
@@ -183,7 +184,7 @@ export class Player {
 
   /** Draw if anything changed: coarse where the device is slow and something moves, then finer, then in full. */
   async tick(now) {
-    if (!this.isReady || this.vr || this.isDrawing) return;
+    if (!this.take || this.vr || this.isDrawing) return;
     const passed = Math.min((now - (this.lastTick ?? now)) / 1000, 1), rest = this.state.playing ? 0 : now - this.lastMove;
     if (this.state.playing) this.advance(passed);
     const step = rest < STILL ? this.scale : rest < 5 * STILL ? Math.max(this.scale - 2, 0) : 0, isDue = this.isChanged || this.state.playing;
