@@ -66,7 +66,7 @@ def write_player(
             f"take must have at most {MAX_EMBEDDED:,} bytes to be held by a page, got {size:,}. Write it with --beside."
         )
     beside = path.with_suffix(".b4d")
-    lights = [{"name": name, "hdr": _encoded(_hdr(light))} for name, light in environments.items()]
+    lights = [{"name": name, "hdr": _encoded(hdr_bytes(light))} for name, light in environments.items()]
     settings = {
         "title": title,
         "take": {"url": beside.name} if is_beside else {"element": "take"},
@@ -84,6 +84,16 @@ def write_player(
             file.write("</script>\n")
         file.write(_SCRIPT)
     return [beside, path] if is_beside else [path]
+
+
+def page_text(title: str, settings: Mapping[str, Any]) -> str:
+    """Return the page of a server: what it shows is at the addresses that the settings name.
+
+    Args:
+        title: What the page is called.
+        settings: What ``engines/web/player.js`` reads.
+    """
+    return _head(title, settings) + _SCRIPT
 
 
 def modules(first: str = "player.js") -> dict[str, str]:
@@ -132,7 +142,7 @@ start(document.getElementById("player"), JSON.parse(document.getElementById("set
 """
 
 
-def _hdr(light: EnvironmentMap) -> bytes:
+def hdr_bytes(light: EnvironmentMap) -> bytes:
     """Return a light as a Radiance picture of at most `ENVIRONMENT_ROWS`."""
     rows = min(light.height, ENVIRONMENT_ROWS)
     return radiance_hdr((light if rows == light.height else light.resized(rows, 2 * rows)).radiance)

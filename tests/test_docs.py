@@ -215,7 +215,6 @@ def of_validation(folder, monkeypatch):
 
 
 def of_viewer(folder, monkeypatch):
-    pytest.importorskip("viser")
     (folder / "person").mkdir()
     save([a_world()["cloud"]] * 4, folder / "person" / "asset.usda")
     return {}

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from beam_warp.checks import require_path
 from beam_warp.cli.common.console import print_json, print_notes
 from beam_warp.cli.common.flags import notes_of
-from beam_warp.cli.view import environments
-from beam_warp.converters.formats import FORMATS, suffix_of
+from beam_warp.cli.view import environments, is_stage, title_of
+from beam_warp.converters.formats import suffix_of
 from beam_warp.converters.player import write_player
 from beam_warp.converters.staging import folders_made, require_writable
 from beam_warp.errors import InvalidOptionError
@@ -38,10 +38,11 @@ def publish(
         raise InvalidOptionError(f"output's name must end in .html for --player, got {page.name}. Rename it.")
     require_writable(page, is_made=True)
     offered = environments(command.environment)
-    if _is_stage(command.input):
-        from beam_warp.stage.takes import staged_take  # it waits for Warp
+    if is_stage(command.input):
+        from beam_warp.stage.stage import Stage  # it waits for Warp
+        from beam_warp.stage.takes import staged_take
 
-        sequence, view, own = staged_take(command.input)
+        sequence, view, own = staged_take(Stage.read(command.input), title_of(command.input))
     else:
         sequence, view, own = read(), {}, {}
     lights = {**own, **{name: read_light() for name, read_light in offered.items()}}
@@ -50,7 +51,7 @@ def publish(
         if suffix_of(take.name) != ".b4d":
             take = Path(folder) / "take.b4d"
             write(sequence, take)
-        paths = write_player(page, take, lights, title=_title(command.input), view=view, is_beside=command.beside)
+        paths = write_player(page, take, lights, title=title_of(command.input), view=view, is_beside=command.beside)
     notes = notes_of(sequence)
     seconds = time.perf_counter() - started
     if command.json:
@@ -61,11 +62,3 @@ def publish(
         size = sum(path.stat().st_size for path in paths)
         print(f"wrote {' and '.join(map(str, paths))}: {len(sequence)} frames, {size / 1e6:.1f} MB, {seconds:.2f} s")
     return 0
-
-
-def _title(path: Path) -> str:
-    return path.resolve().parent.name if path.stem in ("asset", "manifest", "stage") else path.stem
-
-
-def _is_stage(path: Path) -> bool:
-    return path.suffix.lower() == ".json" and suffix_of(path.name) not in FORMATS

@@ -22,10 +22,10 @@ from beam_warp.outputs import require_apart
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.options import LAYERS, DeferredOptions
 from beam_warp.render.path import PathOptions
+from beam_warp.render.pictures import BLACK, PictureOptions, PictureWriter
 from beam_warp.stage.frame_times import FrameTimes, frame_times
 from beam_warp.stage.jobs import FrameRenderer, FrameRequest, RenderJob, RenderTally
 from beam_warp.stage.output import Film, FramePattern, Still, numbered, parse_target
-from beam_warp.stage.pictures import BLACK, PictureOptions, PictureWriter
 from beam_warp.stage.renderers import DeferredFrames, PathFrames
 from beam_warp.stage.stage import Stage
 from beam_warp.study.targets import in_words, outcome

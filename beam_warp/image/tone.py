@@ -16,7 +16,7 @@ result, so that there is one sRGB curve and one rounding:
 Alpha: a view transform is not linear. So light is divided by alpha, transformed, and then composited over the
 background: the edge of a highlight has the highlight's colour, and a picture over a colour equals the picture with
 alpha over that colour. Only an environment behind the subject is light of the same scene, and is added before
-(`beam_warp.stage.backdrops`).
+(`beam_warp.render.backdrops`).
 """
 
 from __future__ import annotations

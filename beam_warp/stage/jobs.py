@@ -17,8 +17,8 @@ from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
 from beam_warp.image.video import VideoOptions, require_encoder, write_mp4
 from beam_warp.jobs.listeners import CountProgress, NotedProgress
+from beam_warp.render.pictures import PictureWriter
 from beam_warp.stage.output import Film, FrameLog, FramePattern, Still, require_folder
-from beam_warp.stage.pictures import PictureWriter
 from beam_warp.stage.shot_digests import ShotDigests
 from beam_warp.stage.stage import Stage
 from beam_warp.world.camera import Camera

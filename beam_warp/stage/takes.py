@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 from beam_warp.stage.assets import StageAsset, joined
@@ -23,24 +22,20 @@ FLOOR_RAYS, FLOOR_OFFSET = 64, 1e-3
 """Rays of each disc of a mesh that find how open it is, and how far above it they begin [m]."""
 
 
-def staged_take(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str, EnvironmentMap]]:
-    """Read a stage as one take.
+def staged_take(stage: Stage, title: str) -> tuple[GaussianSequence, dict[str, Any], dict[str, EnvironmentMap]]:
+    """Return a stage as one take.
 
     All assets are one cloud, frame by frame at the stage's rate. Meshes are flat Gaussians, occluded by the assets.
     What only catches shadows is left out.
 
     Args:
-        path: The stage, as `Stage.read` takes it.
+        stage: The stage.
+        title: What it is called.
 
     Returns:
         The take; what a player shows first (``state``, ``lights``, the assets' ``box``, a camera for each
         frame, as ``engines/web/player.js`` reads them); and the stage's environment by its name, if it has one.
-
-    Raises:
-        MissingFileError: The file, or one that it names, is not there.
-        AssetFormatError: The stage is malformed.
     """
-    stage = Stage.read(path)
     mesh, notes = stage.mesh, stage.notes
     if mesh is not None and mesh.catches_shadows.any():
         notes = (*notes, "what only catches shadows is left out")
@@ -54,7 +49,7 @@ def staged_take(path: Path) -> tuple[GaussianSequence, dict[str, Any], dict[str,
         metadata={**stage.raster_metadata, "notes": "\n".join(notes)},
     )
     light = stage.environment
-    name = f"{path.stem} (stage)"
+    name = f"{title} (stage)"
     turn = 0.0 if light is None else light.rotation_at(0.0)
     view: dict[str, Any] = {
         "state": {"environment": "none" if light is None else name, "rotation": (turn + 180.0) % 360.0 - 180.0},

@@ -10,14 +10,17 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_array, require_count, require_number, require_path
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError
 from beam_warp.image.files import MAX_ENVIRONMENT_PIXELS, MAX_SIDE, read_image
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 MIN_HEIGHT = 4
 """Fewest rows of a map: below, a texel spans more than an octant."""
@@ -203,6 +206,8 @@ def _row_edges(height: int) -> NDArray[np.float64]:
 
 def _overlap_means(old_edges: NDArray[np.float64], new_edges: NDArray[np.float64]) -> scipy.sparse.csr_array:
     """Return the matrix that takes values per old interval to means per new interval; edges rise, ends agree."""
+    import scipy.sparse  # it takes as long to load as a viewer to start
+
     edges = np.union1d(old_edges, new_edges)
     middle = 0.5 * (edges[1:] + edges[:-1])
     old = np.clip(np.searchsorted(old_edges, middle) - 1, 0, len(old_edges) - 2)

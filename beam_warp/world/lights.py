@@ -7,7 +7,7 @@ A new type of light takes one entry in each of these places:
   light at a point, from which sampling, densities and shading of both renderers follow;
 - `beam_warp.light.uploaded.ROWS`: its layout for that kernel;
 - `beam_warp.render.shadow_maps.VIEWS`: where its shadow maps look from;
-- `beam_warp.view.state.PlacedLight.light` and `beam_warp.view.lamps.KINDS`: how it is placed by hand in the viewer;
+- ``engines/web/lamps.js``: how it is placed by hand on a player page;
 - ``beam_warp/world/__init__.pyi`` and the root's: its public name.
 
 ``tests/light/test_uploaded.py`` fails for a type without its entries.

@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -17,6 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from beam_warp._version import __version__
 from beam_warp.converters.common.activations import log_scale
@@ -35,6 +37,9 @@ AXES = "rub"
 
 SEGMENT_FRAMES = 12
 """Frames of a segment: longer ones take a little less space, but their motion takes more planes at every frame."""
+
+SMALLEST = 9
+"""Level of zlib of what is kept."""
 
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every entry, so that the same Gaussians give the same bytes."""
@@ -89,30 +94,61 @@ def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list
         InvalidArrayError: Frames differ in the number of Gaussians or in their arrays.
         OutputError: A file cannot be written; nothing of the call is left behind.
     """
-    first = change_axes(sequence[0], AXES)
-    order = _order(first.positions)
-    bounds = bounds_of(first, options.error_scale)
-    take = _Take(sequence, order, bounds, _raw(first.select(order), options), options)
     with TemporaryFile() as spool, ExitStack() as outputs:
-        blocks = _Blocks(spool)
-        static = blocks.add("static.bin", 1, take.static_planes())
-        segments = []
-        for start in range(0, len(sequence), SEGMENT_FRAMES):
-            frames = range(start, min(start + SEGMENT_FRAMES, len(sequence)))
-            entry = blocks.add(f"{start:06d}.bin", len(frames), take.segment_planes(frames))
-            segments.append({"first": start, "frames": len(frames), **entry})
-        manifest = _manifest(sequence, first, bounds, take.names) | {"static": static, "segments": segments}
-        text = json.dumps(manifest, separators=(",", ":"), ensure_ascii=False).encode()
-        paths = [path, *(path.parent / name for name in blocks.sizes)] if path.suffix == ".json" else [path]
+        text, sizes = _spooled(Take.of(sequence, options), spool, SMALLEST)
+        paths = [path, *(path.parent / name for name in sizes)] if path.suffix == ".json" else [path]
         places = [outputs.enter_context(replacing(place)) for place in paths]
         if path.suffix == ".json":
-            for place, content in zip(places, [text, *blocks.contents()], strict=True):
+            for place, content in zip(places, [text, *_contents(spool, sizes)], strict=True):
                 place.write_bytes(content)
         else:
-            with zipfile.ZipFile(places[0], "w", zipfile.ZIP_STORED) as archive:
-                for name, content in zip([MANIFEST, *blocks.sizes], chain([text], blocks.contents()), strict=True):
-                    archive.writestr(zipfile.ZipInfo(name, _ZIP_TIME), content)
+            _archive(places[0], text, spool, sizes)
     return paths
+
+
+def archive_bytes(sequence: GaussianSequence, options: WriteOptions, level: int) -> bytes:
+    """Return a take as an archive, packed by a level of zlib; raises as `write` does."""
+    spool, archive = BytesIO(), BytesIO()
+    text, sizes = _spooled(Take.of(sequence, options), spool, level)
+    _archive(archive, text, spool, sizes)
+    return archive.getvalue()
+
+
+def _spooled(take: Take, spool: IO[bytes], level: int) -> tuple[bytes, dict[str, int]]:
+    """Put all blocks of a take into a file, one behind the other; return the manifest, and their sizes by name."""
+    sizes: dict[str, int] = {}
+    end = 0
+
+    def placed(block: Block) -> dict[str, Any]:
+        nonlocal end
+        spool.write(block.content)
+        name = block.entry["file"]
+        sizes[name] = len(block.content)
+        offset = end + 30 + len(name)
+        end = offset + len(block.content)
+        return block.entry | {"offset": offset}
+
+    static = placed(take.static_block(level))
+    starts = range(0, len(take.sequence), SEGMENT_FRAMES)
+    segments = [placed(take.segment_block(start, SEGMENT_FRAMES, level)) for start in starts]
+    return json_bytes(take.manifest() | {"static": static, "segments": segments}), sizes
+
+
+def json_bytes(content: Mapping[str, Any]) -> bytes:
+    """Return JSON without spaces."""
+    return json.dumps(content, separators=(",", ":"), ensure_ascii=False).encode()
+
+
+def _contents(spool: IO[bytes], sizes: Mapping[str, int]) -> Iterator[bytes]:
+    """Yield the packed blocks of a file that `_spooled` filled."""
+    spool.seek(0)
+    yield from map(spool.read, sizes.values())
+
+
+def _archive(place: Path | IO[bytes], text: bytes, spool: IO[bytes], sizes: Mapping[str, int]) -> None:
+    with zipfile.ZipFile(place, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in zip([MANIFEST, *sizes], chain([text], _contents(spool, sizes)), strict=True):
+            archive.writestr(zipfile.ZipInfo(name, _ZIP_TIME), content)
 
 
 def _order(positions: NDArray[np.float32]) -> NDArray[np.intp]:
@@ -149,9 +185,27 @@ def _raw(cloud: GaussianCloud, options: WriteOptions) -> Arrays:
     return {name: np.ascontiguousarray(values, np.float32) for name, values in planar.items()}
 
 
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A packed block, and what a manifest says of it but for its offset."""
+
+    entry: dict[str, Any]
+    content: bytes
+
+    @classmethod
+    def of(cls, name: str, frames: int, arrays: Mapping[str, list[Planes]], level: int) -> Block:
+        """Pack the arrays of some frames by a level of zlib."""
+        content = block_bytes(frames, arrays)
+        packed = zlib.compress(content, level)
+        if len(content) > FREE_BYTES + MAX_RATIO * len(packed):  # nearly nothing in it: a decoder would refuse it
+            packed = zlib.compress(content, 0)
+        digest = hashlib.sha256(packed).hexdigest()
+        return cls({"file": name, "bytes": len(packed), "unpacked": len(content), "sha256": digest}, packed)
+
+
 @dataclass
-class _Take:
-    """What the blocks are made of.
+class Take:
+    """A take that is packed block by block; every block can be made at any time.
 
     Attributes:
         sequence: The take.
@@ -159,6 +213,7 @@ class _Take:
         bounds: As `bounds_of` gives them.
         first: What `_raw` gives of the first frame, in the order of the container.
         options: Those of the writer.
+        color_space: That of the radiance.
     """
 
     sequence: GaussianSequence
@@ -166,6 +221,15 @@ class _Take:
     bounds: dict[str, float]
     first: Arrays
     options: WriteOptions
+    color_space: str | None = None
+
+    @classmethod
+    def of(cls, sequence: GaussianSequence, options: WriteOptions) -> Take:
+        """Read the first frame, and settle order and bounds by it."""
+        first = change_axes(sequence[0], AXES)
+        order = _order(first.positions)
+        bounds, raw = bounds_of(first, options.error_scale), _raw(first.select(order), options)
+        return cls(sequence, order, bounds, raw, options, first.radiance_color_space)
 
     def __post_init__(self) -> None:
         """Settle what the static block says, as a decoder reads it."""
@@ -174,19 +238,26 @@ class _Take:
         self._static = {name: _values(planes)[0] for name, planes in self._planes.items()}
         self._turned_from = quaternions(self._static["orientations"])
 
-    @property
-    def names(self) -> list[str]:
-        """Names of all arrays."""
-        return list(self.first)
-
     def _allowed(self, name: str) -> float:
         return _allowed(name, self.bounds[name.partition("_")[0] if name.startswith("radiance") else name])
 
-    def static_planes(self) -> Mapping[str, list[Planes]]:
-        """Return the arrays of the static block: those of the first frame."""
-        return self._planes
+    def static_block(self, level: int) -> Block:
+        """Return the static block: the first frame."""
+        return Block.of("static.bin", 1, self._planes, level)
 
-    def segment_planes(self, frames: range) -> Mapping[str, list[Planes]]:
+    def segment_block(self, first: int, count: int, level: int) -> Block:
+        """Return the segment of at most ``count`` frames from a first one on.
+
+        Raises:
+            InvalidArrayError: A frame differs from the first of the take in the number of Gaussians or in its arrays.
+        """
+        frames = range(first, min(first + count, len(self.sequence)))
+        with threadpool_limits(1, "blas"):  # matrices of few rows: threads would mostly wait for each other
+            planes = self._segment_planes(frames)
+        block = Block.of(f"{first:06d}.bin", len(frames), planes, level)
+        return Block({"first": first, "frames": len(frames), **block.entry}, block.content)
+
+    def _segment_planes(self, frames: range) -> Mapping[str, list[Planes]]:
         """Return what some frames add to the static block: the arrays that differ from it by more than the bound."""
         raw = [self._checked(frame) for frame in frames]
         found = dict[str, list[Planes]]()
@@ -208,6 +279,28 @@ class _Take:
         for name in raw[0]:
             add(name, np.stack([each[name] for each in raw]) - self._static[name])
         return found
+
+    def manifest(self) -> dict[str, Any]:
+        """Return what the manifest says of the take, but for its blocks."""
+        names = self.first
+        colored = {"radianceColorSpace": self.color_space} if "radiance_0" in names else {}
+        return {
+            "format": "b4d",
+            "version": 1,
+            "generator": f"beam-warp {__version__}",
+            "frames": len(self.sequence),
+            "rate": self.sequence.frames_per_second,
+            "count": len(self.order),
+            "topology": self.sequence.topology,
+            "axes": AXES,
+            **colored,
+            "bounds": {
+                name: bound
+                for name, bound in self.bounds.items()
+                if name in (*names, "turns") or (name == "radiance" and colored)
+            },
+            "metadata": {key: value for key, value in self.sequence.metadata.items() if key != "notes"},
+        }
 
     def _checked(self, frame: int) -> Arrays:
         """Return what `_raw` gives of a frame, in the order of the container."""
@@ -256,36 +349,6 @@ def _values(components: Sequence[Planes]) -> NDArray[np.float32]:
     return np.stack([each.values() for each in components], axis=1)
 
 
-class _Blocks:
-    """Packed blocks, kept in a temporary file until the manifest in front of them is known.
-
-    Attributes:
-        sizes: Bytes of each block by its name.
-    """
-
-    def __init__(self, spool: IO[bytes]) -> None:
-        self.sizes: dict[str, int] = {}
-        self._spool, self._end = spool, 0
-
-    def add(self, name: str, frames: int, arrays: Mapping[str, list[Planes]]) -> dict[str, Any]:
-        """Pack a block and return its entry in the manifest."""
-        content = block_bytes(frames, arrays)
-        packed = zlib.compress(content, 9)
-        if len(content) > FREE_BYTES + MAX_RATIO * len(packed):  # nearly nothing in it: a decoder would refuse it
-            packed = zlib.compress(content, 0)
-        self._spool.write(packed)
-        self.sizes[name] = len(packed)
-        offset = self._end + 30 + len(name)
-        self._end = offset + len(packed)
-        digest = hashlib.sha256(packed).hexdigest()
-        return {"file": name, "offset": offset, "bytes": len(packed), "unpacked": len(content), "sha256": digest}
-
-    def contents(self) -> Iterator[bytes]:
-        """Yield the packed blocks."""
-        self._spool.seek(0)
-        yield from (self._spool.read(size) for size in self.sizes.values())
-
-
 def block_bytes(frames: int, arrays: Mapping[str, list[Planes]]) -> bytes:
     """Return a block: the length of its header, the header, the weights of all arrays, and their planes."""
     described, weights, planes = [], [], []
@@ -301,27 +364,3 @@ def block_bytes(frames: int, arrays: Mapping[str, list[Planes]]) -> bytes:
     header = json.dumps({"arrays": described}, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 4)
     return b"".join([struct.pack("<I", len(header)), header, *weights, *planes])
-
-
-def _manifest(
-    sequence: GaussianSequence, first: GaussianCloud, bounds: Mapping[str, float], names: Sequence[str]
-) -> dict[str, Any]:
-    """Return what the manifest says of a take, but for its blocks."""
-    colored = {"radianceColorSpace": first.radiance_color_space} if "radiance_0" in names else {}
-    return {
-        "format": "b4d",
-        "version": 1,
-        "generator": f"beam-warp {__version__}",
-        "frames": len(sequence),
-        "rate": sequence.frames_per_second,
-        "count": len(first),
-        "topology": sequence.topology,
-        "axes": AXES,
-        **colored,
-        "bounds": {
-            name: bound
-            for name, bound in bounds.items()
-            if name in (*names, "turns") or (name == "radiance" and colored)
-        },
-        "metadata": {key: value for key, value in sequence.metadata.items() if key != "notes"},
-    }

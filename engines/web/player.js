@@ -6,8 +6,10 @@ import {Take} from "./b4d.js";
 import {download, element} from "./elements.js";
 import {Environment} from "./environment.js";
 import {Lamps, fromLight} from "./lamps.js";
+import {openLive} from "./live.js";
 import {Orbit, boundsOf, boxOf} from "./orbit.js";
 import {Relight} from "./relight.js";
+import {Stills} from "./stills.js";
 import {enterVr, hasVr} from "./vr.js";
 
 const CHANNELS = {relit: "lit", base_color: "base colour", roughness: "roughness", ambient_occlusion: "ambient occlusion",
@@ -48,7 +50,8 @@ export class Player {
     this.status = element("p", {className: "status"});
     this.orbit = new Orbit(this.canvas, (isByHand) => this.moved(isByHand));
     this.lamps = new Lamps(this.overlay, () => this.lightsChanged());
-    root.replaceChildren(this.canvas, this.overlay, this.header(), this.panel(), this.transport(), this.message);
+    this.stills = settings.stills ? new Stills(this, settings.stills) : null;
+    root.replaceChildren(this.canvas, this.stills?.image ?? "", this.overlay, this.header(), this.panel(), this.transport(), this.message);
     this.bindPage();
   }
 
@@ -69,6 +72,7 @@ export class Player {
 
   async makeCore(backend = this.settings.backend) {
     this.relight = await Relight.create(this.canvas, backend ? {backend} : {});
+    this.relight.environment = await Environment.constant([0.5, 0.5, 0.5]); // until the first one has been blurred
     const on = (name, act) => this.relight.addEventListener(name, ({detail}) => act(detail));
     on("lost", ({message}) => this.say(`The graphics device was lost, and the picture stands still (${message}).`, true, "Start again",
       () => location.reload()));
@@ -82,17 +86,20 @@ export class Player {
   /** Return how the page's own take is read. */
   source() {
     const {url, element: id} = this.settings.take;
-    return id ? {url: "take.b4d", read: rangesOfText(document.getElementById(id).textContent)} : {url: new URL(url, location).href};
+    return id ? {url: "take.b4d", read: rangesOfText(document.getElementById(id).textContent)} : {...this.settings.take, url: new URL(url, location).href};
   }
 
   /** Open a file that was chosen, or what `source` returns. */
   async open(source, name) {
     this.busy(true);
     try {
-      const take = await (source instanceof Blob ? Take.from(source) : Take.open(source.url, source.read));
+      const take = await (source instanceof Blob ? Take.from(source) : this.settings.stills ? openLive(source.url) : Take.open(source.url, source.read));
       await this.relight.open(take);
       this.take = take;
       this.settled = null;
+      this.parts = source.frames ? source : null;
+      this.part = 0;
+      if (this.stillGroup) this.stillGroup.hidden = Boolean(name);
       if (name) document.title = this.title.textContent = name;
       const box = name ? null : this.settings.view?.box;  // of a stage's assets, without its ground
       this.box = box ? boxOf(...box) : boundsOf(take);
@@ -113,8 +120,8 @@ export class Player {
   }
 
   get isReady() { return Boolean(this.take && this.isLit); }
-  get frames() { return this.take?.manifest.frames ?? 1; }
-  get frameRate() { return this.take?.manifest.rate || 30; }
+  get frames() { return (this.parts ?? this.take?.manifest)?.frames ?? 1; }
+  get frameRate() { return (this.parts ?? this.take?.manifest)?.rate || 30; }
   get length() { return this.frames / this.frameRate; }
   get shownTime() { return Math.min(this.state.time, (this.frames - 1) / this.frameRate); }
   get frame() { return Math.min(this.frames - 1, Math.floor(this.state.time * this.frameRate + 1e-6)); }
@@ -122,6 +129,7 @@ export class Player {
   /** Change the state; controls and picture follow. */
   change(values) {
     Object.assign(this.state, values);
+    this.stills?.drop();
     const {state, relight} = this;
     for (const [name, show] of Object.entries(this.shown)) if (name in values) show(state[name]);
     if ("time" in values || "playing" in values) this.showTime();
@@ -143,7 +151,7 @@ export class Player {
     this.wanted = name;
     this.busy(true);
     try {
-      if (given?.hdr) this.environments.set(name, await Environment.load(bytesOf(given.hdr)));
+      if (given?.hdr || given?.url) this.environments.set(name, await Environment.load(given.url ?? bytesOf(given.hdr)));
       const light = this.environments.get(name) ?? await Environment.constant([0, 0, 0]);
       if (this.wanted !== name) return;
       this.relight.environment = light;
@@ -161,6 +169,7 @@ export class Player {
 
   moved(isByHand = false) {
     this.lastMove = now();
+    this.stills?.drop();
     if (this.state.path && isByHand) {
       this.orbit.adopt(this.settings.view.cameras[this.frame]);
       this.change({path: false});
@@ -175,7 +184,7 @@ export class Player {
 
   /** Draw if anything changed: coarse where the device is slow and something moves, then finer, then in full. */
   async tick(now) {
-    if (!this.isReady || this.vr || this.isDrawing) return;
+    if (!this.take || this.vr || this.isDrawing) return;
     const passed = Math.min((now - (this.lastTick ?? now)) / 1000, 1), rest = this.state.playing ? 0 : now - this.lastMove;
     if (this.state.playing) this.advance(passed);
     const step = rest < STILL ? this.scale : rest < 5 * STILL ? Math.max(this.scale - 2, 0) : 0, isDue = this.isChanged || this.state.playing;
@@ -221,13 +230,37 @@ export class Player {
     const size = scale * Math.min(devicePixelRatio || 1, 2), width = Math.round(this.root.clientWidth * size);
     const height = Math.round(this.root.clientHeight * size);
     if (!width || !height) return;
-    Object.assign(this.relight, {time: this.shownTime, shadowMapSize: shadows});
+    Object.assign(this.relight, {time: this.parts ? 0 : this.shownTime, shadowMapSize: shadows});
     if (this.settings.view?.degreesPerSecond) this.relight.rotation = this.rotation;
-    const pose = this.state.path && this.settings.view.cameras[this.frame];
-    const camera = pose ? this.orbit.posed(pose, width, height) : this.orbit.camera(width, height, this.free());
+    const camera = this.camera(width, height);
+    if (this.parts) this.follow(camera);
     this.relight.draw(camera);
-    this.lamps.show(this.orbit.camera(this.root.clientWidth, this.root.clientHeight, this.free(), pose));
+    this.lamps.show(this.camera(this.root.clientWidth, this.root.clientHeight));
     this.settle();
+  }
+
+  /** Return the camera of now: the path's, or the one that is moved by hand. */
+  camera(width, height) {
+    return this.orbit.camera(width, height, this.free(), this.state.path && this.settings.view.cameras[this.frame]);
+  }
+
+  /** Go to the take of the moment, where every frame is a take; the last one is held until then. */
+  async follow(camera) {
+    const {frame, parts} = this;
+    if (this.isFollowing || this.part === frame) return;
+    this.isFollowing = true;
+    try {
+      const take = await openLive(parts.url.replace(/0(?=\.b4d$)/, frame));
+      if (this.parts !== parts) return;
+      await this.relight.open(take);
+      this.take = take;
+      await this.relight.render(camera);
+    } catch (error) {
+      this.stall({first: frame, frames: 1}, error.message);
+    } finally {
+      [this.isFollowing, this.part] = [false, frame];
+      this.wake();
+    }
   }
 
   /** Draw again once the segment of the moment is here. */
@@ -247,7 +280,8 @@ export class Player {
   }
 
   stall({first, frames}, message) {
-    this.say(`Frames ${first + 1} to ${first + frames} cannot be read; the last frame is held (${message.replace(/\.$/, "")}).`);
+    const which = frames > 1 ? `Frames ${first + 1} to ${first + frames}` : `Frame ${first + 1}`;
+    this.say(`${which} cannot be read; the last frame is held (${message.replace(/\.$/, "")}).`);
   }
 
   say(text, isFatal = false, word = "", act = null) {
@@ -308,6 +342,7 @@ export class Player {
       group("Light", true, this.environmentSelect(), this.check("Show it behind", "behind"), this.range("Rotation", "rotation", -180, 180, 1, "°"),
         this.range("Exposure", "exposure", -6, 6, 0.1, " stops"), this.select("View transform", "transform", TRANSFORMS)),
       group("Lamps", true, element("div", {className: "row"}, kind, add), this.lamps.list),
+      this.stillGroup = this.stills ? group("Stills", false, ...this.stills.controls) : "",
       group("Files", false, element("div", {className: "row"}, element("button", {className: "word", textContent: "Save PNG", onclick: () => this.savePng()}),
         element("button", {className: "word", textContent: "Save lights", onclick: () => this.saveLights()}),
         element("button", {className: "word", textContent: "Open …", onclick: () => this.picker.click()})), this.picker,
@@ -416,6 +451,7 @@ export class Player {
 
   /** Save what is shown, in the page's full size. */
   async savePng() {
+    if (this.stills?.isShown) return this.stills.savePng();
     await this.relight.ready();
     this.draw();
     const {width, height} = this.canvas, copy = element("canvas", {width, height}), brush = copy.getContext("2d");

@@ -12,7 +12,8 @@ from support.commands import beam
 from support.drawn_ball import drawn_ball
 
 from beam_warp import converters
-from beam_warp.cli.view import environments
+from beam_warp.cli.common.flags import ReadingFlags
+from beam_warp.cli.view import ViewCommand, environments, shown
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.files import write_exr
 from beam_warp.world.gaussians import GaussianSequence
@@ -36,7 +37,6 @@ def lights(tmp_path):
 
 
 def test_it_says_where_it_is_and_ends_with_ctrl_c(asset, lights, capsys, monkeypatch):
-    pytest.importorskip("viser")
     from beam_warp.view.viewer import Viewer
 
     wait, reports = Viewer.wait, []
@@ -55,12 +55,11 @@ def test_it_says_where_it_is_and_ends_with_ctrl_c(asset, lights, capsys, monkeyp
         assert beam("view", asset, "--environment", lights, "--port", 0, "--json", "--device", "cpu") == 0
     finally:
         signal.signal(signal.SIGINT, before)
-    assert reports[0]["frames"] == 2
+    assert reports[0] == {"url": reports[0]["url"], "frames": 2, "notes": []}
     assert capsys.readouterr() == ("", "")
 
 
 def test_a_taken_port_is_one_clear_line(asset, refused):
-    pytest.importorskip("viser")
     with socket.socket() as holder:
         holder.bind(("127.0.0.1", 0))
         holder.listen()
@@ -72,7 +71,6 @@ def test_a_taken_port_is_one_clear_line(asset, refused):
     ("words", "error"),
     [
         (["--open", "--no-open"], "error: --open must be given once"),
-        (["--rate", "0"], "error: --rate must be a number in"),
         (["--longest", "3"], "error: --longest must be an integer in"),
         (["--environment", "nowhere.hdr"], "error: --environment must be a file or a folder, got nowhere.hdr"),
         (["--port", "0", "--no-open"], "error: "),
@@ -80,6 +78,23 @@ def test_a_taken_port_is_one_clear_line(asset, refused):
 )
 def test_mistakes_are_found_before_anything_is_read(words, error, refused):
     refused("view", "no such asset", *words, says=error)
+
+
+def test_a_container_is_served_as_it_is_unless_it_is_read_otherwise(asset, tmp_path):
+    path = tmp_path / "ball.b4d"
+    converters.write(converters.read(asset), path)
+    sequence, parts = shown(ViewCommand(asset=path), {})
+    assert parts["file"] == path
+    (ground,) = {make().surface.vertices[0, 2] for make in parts["grounds"].values()}
+    assert ground == pytest.approx(-0.5, abs=0.02)
+    sequence, parts = shown(ViewCommand(asset=path, reading=ReadingFlags(low_pass=0.1)), {})
+    assert parts["file"] is None
+    assert sequence.metadata["raster_low_pass"] == "0.1"
+
+
+def test_a_stage_says_itself_how_assets_are_read(refused, tmp_path):
+    (tmp_path / "set.json").write_text("{}")
+    refused("view", tmp_path / "set.json", "--low-pass", 0.1, says="error: a stage must state how its assets are read")
 
 
 def test_lights_are_those_given_then_those_built_in(lights):

@@ -9,7 +9,6 @@ from support.figure_asset import figure_asset
 from beam_warp.errors import InvalidOptionError
 from beam_warp.light.uploaded import ROWS, upload_lights
 from beam_warp.render.shadow_maps import VIEWS, ShadowCasters, light_views
-from beam_warp.view.state import PlacedLight
 from beam_warp.world.camera import Camera
 from beam_warp.world.lights import LIGHT_TYPES, PointLight, lights_to_json
 from beam_warp.world.shot import Shot
@@ -25,8 +24,6 @@ def shot_of(light):
 
 def test_every_type_of_light_has_its_entries():
     assert set(ROWS) == set(VIEWS) == set(LIGHT_TYPES.values())
-    for kind in LIGHT_TYPES:
-        assert type(PlacedLight(kind=kind, position=(0, 0, 1)).light()) is LIGHT_TYPES[kind]
 
 
 @pytest.mark.parametrize(
@@ -45,11 +42,6 @@ def test_what_is_no_light_is_refused(take):
         InvalidOptionError, match=rf"lights must be of {known}, got SimpleNamespace\. Choose one of these types\."
     ):
         take()
-
-
-def test_a_placed_light_of_no_kind_is_refused():
-    with pytest.raises(InvalidOptionError, match=r"lights must be of .*, got area\."):
-        PlacedLight(kind="area", position=(0, 0, 1)).light()
 
 
 def test_without_lights_there_is_one_row_of_nothing():

@@ -10,9 +10,9 @@ from support.drawn_ball import relightable
 from beam_warp.errors import OutputError
 from beam_warp.image.files import read_image
 from beam_warp.image.video import VideoOptions, find_ffmpeg
+from beam_warp.render.pictures import PictureOptions, PictureWriter
 from beam_warp.stage.jobs import FrameRequest, RenderInterruptedError, RenderJob
 from beam_warp.stage.output import Film, FramePattern
-from beam_warp.stage.pictures import PictureOptions, PictureWriter
 from beam_warp.world.camera import Camera
 from beam_warp.world.shot import RenderedImage, Shot
 

@@ -1,58 +1,62 @@
-"""The viewer as people meet it: a page in headless Chromium, a mouse, and what the screen shows then."""
+"""`beam view` as people meet it: its page in headless Chromium, with its picture, its time, and the server's stills."""
 
-import os
-import shutil
-import time
-from io import BytesIO
-from queue import SimpleQueue
+import json
 
 import numpy as np
 import pytest
-from PIL import Image as PillowImage
-from support.figure_asset import figure_asset
+from PIL import Image
+from support.drawn_ball import drawn_ball
+from support.player_pages import (
+    BACKGROUND,
+    HEIGHT,
+    PATIENCE,
+    WIDTH,
+    as_rendered,
+    camera_of,
+    picture,
+    ready,
+    said,
+    settled,
+    until,
+)
+from web.viewers import CHROMIUM, FLAGS
 
-from beam_warp.demo.lights import stage, studio
+from beam_warp import converters
+from beam_warp.cli.view import ViewCommand, shown
+from beam_warp.demo.lights import studio
+from beam_warp.errors import AssetFormatError
 from beam_warp.image.files import read_image
+from beam_warp.image.metrics import psnr
+from beam_warp.image.tone import display_over
+from beam_warp.render.path import PathOptions, PathRenderer
+from beam_warp.view.takes import SEGMENT_FRAMES
+from beam_warp.view.viewer import Viewer, ViewOptions
+from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.shot import Shot
 
-pytest.importorskip("viser")
 sync_api = pytest.importorskip("playwright.sync_api")
 
-CHROMIUM = os.environ.get("BEAM_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (set BEAM_CHROMIUM)", allow_module_level=True)
 
 pytestmark = pytest.mark.slow
 
-WIDTH, HEIGHT = 900, 480
-SEEN = slice(320, 560)
-"""Columns between the note on the left, which says that this browser draws in software, and the controls."""
-
-PATIENCE = 90.0
-FLAGS = (
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync"),
-)
-SHARP = "&fixedDpr=1"
-"""Part of the address: the page takes away no pixels where it is slow."""
-
-FIRST = {"frame": 0, "channel": "lit", "environment": "studio", "rotation": 0.0, "exposure": 0.0}
-
-BACKGROUND = (33, 33, 33)
+FRAMES = SEGMENT_FRAMES + 2
+LIGHTS = {"studio": studio}
+LOST = set()
+"""Frames that cannot be read."""
 
 
-@pytest.fixture(scope="module")
-def viewer():
-    from beam_warp.view.viewer import Viewer, ViewOptions
-
-    served = Viewer(
-        figure_asset(frame_count=3),
-        {"studio": studio, "stage": stage},
-        title="figure",
-        options=ViewOptions(port=0, device="cpu"),
+def ball(frame, count=1200):
+    return drawn_ball(center=(0.02 * frame, 0.0, 0.0), count=count).with_arrays(
+        ids=np.arange(count), scales=np.tile([0.035, 0.035, 1e-3], (count, 1)), roughness_error=np.full(count, 0.1)
     )
-    yield served
-    served.close()
-    assert not [thread for thread in (served._ticker, served._loop._thread) if thread.is_alive()]
+
+
+def read(frame):
+    if frame in LOST:
+        raise AssetFormatError(f"frame {frame} must be a file, got none. Put it back.")
+    return ball(frame)
 
 
 @pytest.fixture(scope="module")
@@ -63,253 +67,138 @@ def browser():
         opened.close()
 
 
-@pytest.fixture(scope="module")
-def opened(viewer, browser):
-    """A page in which nothing goes wrong."""
-    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-    wrong = []
-    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.goto(viewer.url + SHARP)
-    note = page.get_by_text("Software WebGL rendering detected")
-    if note.is_visible():
-        page.locator(".mantine-Notification-closeButton").first.click()
-    yield page
-    page.close()
+@pytest.fixture
+def opened(browser):
+    """Serves a sequence and opens its page; in the end, nothing must have gone wrong in it."""
+    served, pages, wrong = [], [], []
+
+    def open_page(sequence, environments=LIGHTS, **parts):
+        served.append(Viewer(sequence, environments, options=ViewOptions(port=0, device="cpu"), **parts))
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, reduced_motion="reduce")
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.goto(served[-1].url)
+        pages.append(page)
+        return ready(page)
+
+    yield open_page
+    for closed in (*pages, *served):
+        closed.close()
     assert wrong == []
 
 
+MOVING = GaussianSequence(FRAMES, read, frames_per_second=10.0, topology="constant")
+
+
 @pytest.fixture
-def page(viewer, opened):
-    """The page on the first state, with its sharp picture."""
-    viewer.change(**FIRST)
-    opened.get_by_role("button", name="Frame subject").click()  # keys that move sliders orbit too
-    settled(opened, viewer)
-    return opened
+def page(opened):
+    return opened(MOVING)
 
 
-def screen(page):
-    """What is seen between the note and the controls."""
-    picture = PillowImage.open(BytesIO(page.screenshot())).convert("RGB")
-    return np.asarray(picture)[:, SEEN].astype(int)
+def agree(page, cloud):
+    expected, alpha = as_rendered(page, cloud, studio())
+    assert alpha.mean() > 0.1
+    return psnr(picture(page) / 255.0, expected / 255.0, alpha > 0.99) > 38.0
 
 
-def ours(viewer, client):
-    """What the page of a client is to show, drawn now, in the one thread that may draw."""
-    drawn = SimpleQueue()
-    viewer._loop.export(client, drawn.put)
-    return drawn.get(timeout=PATIENCE).pixels[:, SEEN].astype(int)
+def test_it_shows_what_the_renderer_shows_at_any_time(page):
+    assert agree(page, ball(0))
+    page.evaluate(f"player.change({{time: {(FRAMES - 1) / 10.0}}})")
+    until(page, f"player.frame === {FRAMES - 1}")
+    assert agree(page, ball(FRAMES - 1))
 
 
-def newest(viewer):
-    return max(viewer._pages)
+def test_frames_with_nothing_in_common_are_shown_one_by_one(opened):
+    page = opened(GaussianSequence.from_clouds([ball(0), ball(4, count=900), ball(8, count=1500)]))
+    page.evaluate("player.change({time: 2 / player.frameRate})")
+    until(page, "player.part === 2 && player.take.manifest.count === 1500")
+    assert agree(page, ball(8, count=1500))
+    page.evaluate("player.change({playing: true})")
+    until(page, "player.part === 1")
 
 
-def differs(one, other):
-    """The share of pixels that differ by more than what JPEG, scaling and rounding make of them."""
-    return float((np.abs(one - other).max(axis=-1) > 24).mean())
+def test_a_lost_frame_holds_the_last_one_and_comes_back(opened):
+    LOST.add(FRAMES - 1)
+    try:
+        page = opened(MOVING)
+        held = picture(page)
+        page.evaluate("player.change({time: 0.65})")
+        words = said(page)
+        assert words.startswith(f"Frames {SEGMENT_FRAMES + 1} to {FRAMES} cannot be read; the last frame is held")
+        assert "must be a file, got none. Put it back" in words
+        np.testing.assert_array_equal(picture(page), held)
+    finally:
+        LOST.clear()
+    page.wait_for_timeout(2200)
+    page.evaluate("player.change({time: 0.7})")
+    until(page, "player.message.hidden")
+    assert agree(page, ball(FRAMES - 1))
 
 
-def settled(page, viewer, before=None):
-    """Wait for the screen to show what we draw, and to be another one than before."""
-    deadline = time.monotonic() + PATIENCE
-    shown = None
-    while time.monotonic() < deadline:
-        page.wait_for_timeout(300)
-        if not viewer._pages:
-            continue
-        shown, wanted = screen(page), ours(viewer, newest(viewer))
-        is_new = before is None or differs(shown, before) > 0.005
-        if is_new and wanted.shape == shown.shape and differs(shown, wanted) < 0.04:
-            return shown
-    pytest.fail(f"the screen did not settle within {PATIENCE} s")
-
-
-def choose(page, shown, wanted):
-    page.locator(f"input[value='{shown}']").first.click()
-    page.get_by_role("option", name=wanted, exact=True).click()
-
-
-def slide(page, label, key, times=1):
-    """Move a slider by keys; its thumb is in the row of its label."""
-    row = page.locator("label", has_text=label).locator("xpath=ancestor::div[.//*[@role='slider']][1]")
-    thumb = row.get_by_role("slider").first
-    thumb.focus()
-    for _ in range(times):
-        thumb.press(key)
-
-
-def test_the_page_shows_our_picture(page, viewer):
-    shown, wanted = screen(page), ours(viewer, newest(viewer))
-    covered = (np.abs(wanted - BACKGROUND).max(axis=-1) > 8).mean()
-    assert 0.1 < covered < 0.8
-    assert differs(shown, np.broadcast_to(BACKGROUND, shown.shape)) > 0.5 * covered
-    # where the picture is smooth, scaling changes nothing: colours agree to a level or two
-    step = np.abs(np.diff(wanted, axis=1)).max(axis=-1)
-    assert np.median(np.abs(shown - wanted).max(axis=-1)[:, 1:-1][step[:, 1:] + step[:, :-1] < 4]) <= 2
-    assert "6,000 Gaussians" in page.content()
-
-
-def test_a_drag_orbits(page, viewer):
-    before = screen(page)
-    start, _ = viewer._loop._schedule.seen(newest(viewer))
-    page.mouse.move(330, 300)
-    page.mouse.down()
-    page.mouse.move(430, 300, steps=8)
-    page.mouse.up()
-    turned = settled(page, viewer, before)
-    end, _ = viewer._loop._schedule.seen(newest(viewer))
-    center = viewer._painter.subject.center
-    away = [np.asarray(view.position) - center for view in (start, end)]
-    assert np.linalg.norm(away[1]) == pytest.approx(np.linalg.norm(away[0]), rel=1e-3)  # it goes round, not away
-    angle = np.degrees(np.arctan2(away[1][1], away[1][0]) - np.arctan2(away[0][1], away[0][0]))
-    assert 10.0 < abs((angle + 180.0) % 360.0 - 180.0) < 170.0
-    page.get_by_role("button", name="Frame subject").click()
-    settled(page, viewer, turned)
-    back, _ = viewer._loop._schedule.seen(newest(viewer))
-    np.testing.assert_allclose(back.position, start.position, atol=1e-2)
-
-
-def test_sliders_change_time_and_light(page, viewer):
-    before = screen(page)
-    slide(page, "Frame", "ArrowRight", 2)
-    moved = settled(page, viewer, before)
-    assert viewer.state.frame == 2
-    slide(page, "Rotation", "End")
-    turned = settled(page, viewer, moved)
-    assert viewer.state.rotation == 180.0
-    slide(page, "Exposure", "ArrowLeft", 15)
-    settled(page, viewer, turned)
-    assert viewer.state.exposure == pytest.approx(-1.5)
-
-
-def test_choices_change_the_picture(page, viewer):
-    before = screen(page)
-    choose(page, "lit", "normals")
-    normals = settled(page, viewer, before)
-    assert viewer.state.channel == "normals"
-    choose(page, "normals", "depth")
-    settled(page, viewer, normals)
-    choose(page, "depth", "lit")
-    lit = settled(page, viewer, normals)
-    choose(page, "studio", "stage")
-    settled(page, viewer, lit)
-
-
-def test_time_runs(page, viewer):
-    row = page.locator("label", has_text="Play").locator("xpath=ancestor::div[.//input[@type='checkbox']][1]")
-    row.locator("input[type=checkbox]").click()
-    seen, deadline = set(), time.monotonic() + PATIENCE
-    while len(seen) < 3 and time.monotonic() < deadline:
-        seen.add(viewer.state.frame)
-        time.sleep(0.01)
-    viewer._controls._playing.value = False
-    assert seen == {0, 1, 2}
-
-
-def test_pictures_can_be_kept(page, viewer, tmp_path):
-    page.get_by_text("Save", exact=True).click()
-    for name, suffix in (("Save PNG", "png"), ("Save EXR", "exr")):
+def test_a_still_is_drawn_by_paths_and_kept_until_something_changes(page, tmp_path):
+    page.get_by_text("Stills", exact=True).click()
+    page.get_by_label("Samples").fill("4")
+    page.get_by_label("Size").select_option("quarter")
+    page.get_by_role("button", name="Draw still").click()
+    until(page, "player.stills.isShown && !player.stills.isDrawing")
+    assert page.get_by_text("4 of 4 samples").is_visible()
+    camera = camera_of(page, 0.25)
+    image = PathRenderer(PathOptions(samples=4), device="cpu").draw(
+        Shot(cloud=ball(0), camera=camera, environment=studio())
+    )
+    page.get_by_text("Files", exact=True).click()
+    kept = {}
+    for name in ("Save PNG", "Save EXR"):
         with page.expect_download(timeout=1000 * PATIENCE) as waiting:
             page.get_by_role("button", name=name).click()
-        path = tmp_path / f"kept.{suffix}"
-        waiting.value.save_as(path)
-        image = read_image(path)
-        assert (image.width, image.height) == (WIDTH, HEIGHT)
-        if suffix == "exr":
-            assert 0.05 < image.alpha.mean() < 0.8
+        kept[name] = tmp_path / waiting.value.suggested_filename
+        waiting.value.save_as(kept[name])
+    shown_image = np.asarray(Image.open(kept["Save PNG"])).astype(int)
+    np.testing.assert_allclose(shown_image, display_over(image.rgb, image.alpha, background=BACKGROUND), atol=1)
+    np.testing.assert_allclose(read_image(kept["Save EXR"]).alpha, image.alpha, atol=1e-4)
+    page.mouse.move(200, 200)
+    page.mouse.down()
+    page.mouse.move(220, 200)
+    page.mouse.up()
+    assert not page.evaluate("player.stills.isShown")
+    settled(page)
 
 
-def test_two_pages_look_from_two_sides_and_one_leaves(page, viewer, browser):
-    first = newest(viewer)
-    other = browser.new_page(viewport={"width": 700, "height": HEIGHT})
-    other.goto(viewer.url + SHARP)
-    deadline = time.monotonic() + PATIENCE
-    while newest(viewer) == first and time.monotonic() < deadline:
-        other.wait_for_timeout(100)
-    sizes = {viewer._loop._schedule.seen(client)[0].width for client in (first, newest(viewer))}
-    assert sizes == {WIDTH, 700}
-    viewer.change(rotation=50.0)
-    other.close()  # in the middle of its frame
-    viewer.change(rotation=120.0)
-    deadline = time.monotonic() + PATIENCE
-    while len(viewer._pages) > 1 and time.monotonic() < deadline:
-        page.wait_for_timeout(100)
-    assert len(viewer._pages) == 1
-    settled(page, viewer)
+def test_what_a_still_cannot_be_is_one_line(page):
+    page.evaluate("player.stills.samples.value = 0.5; player.state.environment = 'dropped.hdr'; player.stills.draw()")
+    assert said(page).startswith("The still cannot be drawn: samples must be")
+    page.evaluate("player.stills.samples.value = 1; player.stills.draw()")
+    until(page, "/environment must be one of studio, none, got .dropped.hdr/.test(player.message.textContent)")
+    assert not page.evaluate("player.stills.isDrawing || player.stills.isShown")
 
 
-def test_a_window_that_is_resized(page, viewer):
-    page.set_viewport_size({"width": WIDTH, "height": 400})
-    shown = settled(page, viewer)
-    page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
-    assert shown.shape[0] == 400
+def test_errors_of_an_asset_are_stills_with_a_legend(page):
+    page.get_by_text("Stills", exact=True).click()
+    page.get_by_label("Shows").select_option("standard error of roughness")
+    assert not page.get_by_label("Samples").is_visible()
+    page.evaluate("player.stills.draw()")
+    until(page, "player.stills.isShown && !player.stills.isDrawing")
+    assert page.get_by_alt_text("What its colours mean").is_visible()
 
 
-def test_what_fails_is_said_on_the_page(page, viewer, monkeypatch):
-    def fail(*_, **__):
-        raise MemoryError("too small a device")
-
-    before = screen(page)
-    with monkeypatch.context() as broken:
-        broken.setattr(viewer._painter, "draw", fail)
-        viewer.change(environment="none")
-        page.get_by_text("This could not be drawn").first.wait_for(timeout=1000 * PATIENCE)
-    viewer.change(environment="stage")
-    settled(page, viewer, before)
-
-
-def test_a_light_is_added_dragged_and_taken_away(page, viewer):
-    while page.get_by_text("This could not be drawn").count():  # left by another test: it may lie over the handles
-        page.locator("[class*=Notification] button").first.click()
-        page.wait_for_timeout(500)
-    add = page.get_by_role("button", name="Add light")
-    if not add.is_visible():
-        page.get_by_text("Lamps", exact=True).click()
-    viewer.change(environment="none")
-    dark = settled(page, viewer)
-    add.click()
-    deadline = time.monotonic() + PATIENCE
-    while not viewer.state.lights and time.monotonic() < deadline:
-        page.wait_for_timeout(100)
-    page.wait_for_timeout(1000)
-    (light,) = viewer.state.lights
-    view, _ = viewer._loop._schedule.seen(newest(viewer))
-    size = 0.15 * viewer._painter.subject.extent
-    place = np.asarray(light.position)
-    arrow = place + np.array([0.0, 0.0, 0.7 * size])  # the handle's arrow upwards
-    higher = arrow + np.array([0.0, 0.0, 0.2])
-    (x, y, _), (up_x, up_y, _) = view.camera(1.0, 4096).project(np.stack([arrow, higher]))
-    for wait in (300, 1000, 3000):  # a busy page takes a while to see that the mouse is over the arrow
-        page.mouse.move(x - 40, y - 40)
-        page.mouse.move(x, y)
-        page.wait_for_timeout(wait)
-        page.mouse.down()
-        page.mouse.move(up_x, up_y, steps=6)
-        page.mouse.up()
-        page.wait_for_timeout(1000)
-        if viewer.state.lights != (light,):
-            break
-    (moved,) = viewer.state.lights
-    step = np.asarray(moved.position) - place
-    assert step[2] == pytest.approx(0.2, abs=0.05)
-    np.testing.assert_allclose(step[:2], 0.0, atol=1e-3)
-    assert differs(screen(page), dark) > 0.02
-    page.get_by_role("button", name="Remove").first.click()
-    while viewer.state.lights and time.monotonic() < deadline:
-        page.wait_for_timeout(100)
-    assert viewer.state.lights == ()
-    settled(page, viewer)
+def test_a_stage_stands_on_its_ground(opened, tmp_path):
+    converters.write(GaussianSequence.from_clouds([ball(0)]), tmp_path / "a.usda")
+    content = {"beam-stage": 1, "assets": ["a.usda"], "meshes": [{"ground": True, "size": 8}]}
+    content |= {"camera": {"type": "fixed", "position": [0, -4, 1], "target": [0, 0, 0], "fov": 40}}
+    (tmp_path / "set.json").write_text(json.dumps(content | {"environment": {"radiance": [1, 1, 1]}}))
+    sequence, parts = shown(ViewCommand(asset=tmp_path / "set.json"), {})
+    page = opened(sequence, **parts)
+    assert page.evaluate("player.state.environment") == "set (stage)"
+    drawn = picture(page)
+    assert drawn[-20, WIDTH // 2].min() > 60  # the ground
+    page.evaluate(
+        "Object.assign(player.stills.size, {value: 0.25}); player.stills.samples.value = 2; player.stills.draw()"
+    )
+    until(page, "player.stills.isShown && !player.stills.isDrawing")
+    traced = picture_of_still(page)
+    assert traced[-5, WIDTH // 8].min() > 60
 
 
-def test_paths_are_traced_once_nothing_moves(page, viewer):
-    if not viewer._painter.can_trace:
-        pytest.skip("there is no path tracer")
-    viewer.change(samples=4)
-    choose(page, "deferred", "path traced")
-    page.get_by_text("· 4 samples ·").wait_for(timeout=1000 * PATIENCE)
-    covered = np.abs(screen(page) - BACKGROUND).max(axis=-1) > 24
-    viewer.change(mode="deferred")
-    deferred = np.abs(settled(page, viewer) - BACKGROUND).max(axis=-1) > 24
-    both = (covered & deferred).sum() / (covered | deferred).sum()
-    assert both > 0.85  # the same subject, but for the edges of a coarser picture
+def picture_of_still(page):
+    with page.expect_download(timeout=1000 * PATIENCE) as waiting:
+        page.evaluate("player.savePng()")
+    return np.asarray(Image.open(waiting.value.path()).convert("RGB"))

@@ -16,8 +16,8 @@ from beam_warp.cli.drawing.flags import DeferredFlags, Render
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.options import UNSHADOWED, DeferredOptions
+from beam_warp.render.pictures import PictureWriter
 from beam_warp.stage.jobs import FrameContext, FrameRenderer
-from beam_warp.stage.pictures import PictureWriter
 from beam_warp.study.relighting import TruePixels, covered_pixels, deferred_frame, noise_of, path_frame
 from beam_warp.study.table import Settings
 from beam_warp.study.targets import Rung, Target, cheapest, climbed, fitted

@@ -3,7 +3,6 @@
 import base64
 import json
 import re
-import time
 import zipfile
 from io import BytesIO
 
@@ -12,20 +11,16 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.drawn_ball import drawn_ball
+from support.player_pages import HEIGHT, WIDTH, as_rendered, picture, ready, said, settled, until
 from web.viewers import CHROMIUM, FLAGS
 
 from beam_warp import converters
 from beam_warp.cli.convert import main
 from beam_warp.image.files import write_exr
 from beam_warp.image.metrics import psnr
-from beam_warp.image.tone import display_over
-from beam_warp.render.deferred import DeferredRenderer
-from beam_warp.render.options import DeferredOptions
-from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.lights import PointLight, read_lights
-from beam_warp.world.shot import Shot
 
 sync_api = pytest.importorskip("playwright.sync_api")
 
@@ -34,8 +29,6 @@ if CHROMIUM is None:
 
 pytestmark = pytest.mark.slow
 
-WIDTH, HEIGHT = 800, 420
-PATIENCE = 120.0
 WEBGPU = (
     *("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--use-angle=vulkan", "--use-vulkan=swiftshader"),
     "--enable-features=Vulkan",
@@ -113,54 +106,14 @@ def page(opened, written):
     return ready(opened(written))
 
 
-def ready(page):
-    """Wait for the first picture."""
-    until(page, "window.player?.isReady && player.drawn === 0 && !player.isDrawing")
-    return page
-
-
-def until(page, condition):
-    """Wait for an expression; playwright's own way would need a page without a policy."""
-    last = time.monotonic() + PATIENCE
-    while not page.evaluate(f"Boolean({condition})"):
-        assert time.monotonic() < last, f"{condition}: {page.locator('.message').inner_text()}"
-        page.wait_for_timeout(50)
-
-
-def settled(page):
-    """Wait until nothing moves and the picture is sharp."""
-    page.wait_for_timeout(100)
-    until(page, "!player.isChanged && player.pending == null && !player.isDrawing")
-
-
-def picture(page):
-    """The picture as it is saved, (height, width, 3)."""
-    settled(page)
-    with page.expect_download(timeout=1000 * PATIENCE) as waiting:
-        page.evaluate("player.savePng()")
-    return np.asarray(Image.open(waiting.value.path()).convert("RGB"))
-
-
-def said(page):
-    page.locator(".message").wait_for(state="visible", timeout=1000 * PATIENCE)
-    return page.locator(".message p").inner_text()
-
-
 @pytest.mark.parametrize("backend", ["webgl2", "webgpu"])
 def test_it_shows_what_the_renderer_shows(opened, written, light, browsers, browser, backend):
     other = browser if backend == "webgl2" else browsers((*FLAGS, *WEBGPU))
     page = ready(opened(written, browser=other))
     assert page.evaluate("player.relight.backend") == backend
-    seen = picture(page).astype(np.float64)
-    given = page.evaluate("player.orbit.camera(player.canvas.width, player.canvas.height, player.free())")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.reshape(given["worldToCamera"], (3, 3)).T, given["position"]
-    camera = Camera(given["width"], given["height"], *given["focal"], *given["center"], pose)
-    shot = Shot(cloud=ball(0), camera=camera, environment=EnvironmentMap.read(light))
-    image = DeferredRenderer(DeferredOptions(environment_shadows=0, bounces=0), device="cpu").draw(shot)
-    expected = display_over(image.rgb, image.alpha, background=np.full(3, 33 / 255.0))
-    assert image.alpha.mean() > 0.1
-    assert psnr(seen / 255.0, expected / 255.0, image.alpha > 0.99) > 38.0
+    expected, alpha = as_rendered(page, ball(0), EnvironmentMap.read(light))
+    assert alpha.mean() > 0.1
+    assert psnr(picture(page) / 255.0, expected / 255.0, alpha > 0.99) > 38.0
     if other is not browser:
         page.close()
         other.close()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from beam_warp.stage.backdrops import Backdrop
+from beam_warp.render.backdrops import Backdrop
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 

@@ -7,8 +7,8 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import linear_to_srgb, srgb_to_linear
 from beam_warp.image.files import read_image
 from beam_warp.image.tone import display, display_over
-from beam_warp.stage.backdrops import Backdrop
-from beam_warp.stage.pictures import PictureOptions, PictureWriter
+from beam_warp.render.backdrops import Backdrop
+from beam_warp.render.pictures import PictureOptions, PictureWriter
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud

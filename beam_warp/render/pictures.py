@@ -14,7 +14,7 @@ from beam_warp.image.color import srgb_to_linear
 from beam_warp.image.files import write_exr, write_png
 from beam_warp.image.tone import EXPOSURE_RANGE, TRANSFORMS, ViewTransform, display_over
 from beam_warp.raster.channels import channel_layers
-from beam_warp.stage.backdrops import Backdrop
+from beam_warp.render.backdrops import Backdrop
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.shot import RenderedImage, Shot
 
