@@ -6,11 +6,11 @@ The take is that of `delivery_take.py`; ``--take`` names a file that holds it, m
 headless Chromium. Without a GPU it draws by SwiftShader, on the processor: pictures a second are then those of a
 processor, and say nothing of a graphics card. ``--gpu`` leaves the choice of the GPU to the browser.
 
-A seek goes to a segment that is not at hand ("cold"), or to one that is ("warm"). It is "ready" when the moment's Gaussians
-are on the GPU in order of depth, and "drawn" when the picture can be read. While the take plays, memory is sampled after
-a collection of garbage: the page's heap by the DevTools protocol, what the page's process and the one that draws hold by
-the system, textures by the renderer's own count. A line is fitted to the samples after the first fifth; its slope comes
-with a standard error.
+A seek goes to a segment that is not at hand ("cold"), or to one that is ("warm"). It is "ready" when the moment's
+Gaussians are on the GPU in order of depth, and "drawn" when the picture can be read. While the take plays, memory is
+sampled after a collection of garbage: the page's heap by the DevTools protocol, what the page's process and the one
+that draws hold by the system, textures by the renderer's own count. A line is fitted to the samples after the first
+fifth; its slope comes with a standard error.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianSequence
 
 GPU_FLAGS = ("--enable-features=Vulkan", "--use-angle=vulkan", "--enable-gpu")
-SEEKS = 9
+SEEKS = 7
 SAMPLES = 30
 SETTLING = 0.2
 """Share of the samples at the beginning, while caches fill, that no line is fitted to."""
@@ -87,7 +87,9 @@ COLD = """async (seeks) => {
 WARM = """async (seeks) => {
   const {segments, rate} = take.manifest, found = [];
   for (const {first} of segments) await seek((first + 0.4) / rate);
-  for (let k = 0; k < seeks; k++) found.push(await seek((segments[(2 * k + 1) % segments.length].first + 3.4 + 0.1 * k) / rate));
+  for (let k = 0; k < seeks; k++) {
+    found.push(await seek((segments[(2 * k + 1) % segments.length].first + 3.4 + 0.1 * k) / rate));
+  }
   return found;
 }"""
 
@@ -133,8 +135,9 @@ class Host(BaseHTTPRequestHandler):
             content = content[int(asked[1]) : int(asked[2]) + 1]
             self.send_header("Content-Range", f"bytes {asked[1]}-{int(asked[1]) + len(content) - 1}/{total}")
         kind = {".js": "text/javascript", ".b4d": "application/octet-stream"}.get(Path(name).suffix, "text/html")
-        for header, value in (("Content-Type", kind), ("Content-Length", str(len(content))), ("Cache-Control", "no-store")):
-            self.send_header(header, value)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
         self.end_headers()
         self.wfile.write(content)
 
@@ -205,12 +208,15 @@ def measure(backend: str, path: Path, arguments: argparse.Namespace) -> dict[str
         page.goto(address)
         page.wait_for_function("window.isThere")
         opened = page.evaluate(BEGIN, [backend, camera])
+        print(f"{backend}: opened after {opened:.0f} ms", flush=True)
         cold, warm = (seek_row(page.evaluate(script, SEEKS)) for script in (COLD, WARM))
+        print(f"{backend}: a seek takes, in the median and at most [ms], {cold}; to what is at hand {warm}", flush=True)
         seconds, samples = 60.0 * arguments.minutes, []
         page.evaluate(PLAY, seconds)
         began = time.monotonic()
         for number in range(SAMPLES):
-            page.wait_for_timeout(max(1000.0 * (began + seconds * (number + 1) / (SAMPLES + 1) - time.monotonic()), 0.0))
+            due = began + seconds * (number + 1) / (SAMPLES + 1)
+            page.wait_for_timeout(max(1000.0 * (due - time.monotonic()), 0.0))
             samples.append({"minutes": (time.monotonic() - began) / 60.0} | memory(page, browser))
         page.wait_for_function("played.isOver")
         played, said = page.evaluate("[played, heard]")
@@ -246,12 +252,15 @@ def main() -> int:
             clouds = [cloud for _, cloud in take(build_figure(), arguments.gaussians, arguments.frames)]
             write(GaussianSequence.from_clouds(clouds, frames_per_second=FRAMES_PER_SECOND), path, WriteOptions())
         manifest = Container(path).manifest
-        result = {
-            "take": {"gaussians": manifest["count"], "frames": manifest["frames"], "megabytes": path.stat().st_size / 1e6},
+        size = path.stat().st_size / 1e6
+        result: dict[str, Any] = {
+            "take": {"gaussians": manifest["count"], "frames": manifest["frames"], "megabytes": size},
             "graphics": "the browser's choice" if arguments.gpu else "SwiftShader, on the processor",
-            "players": {"rows": [measure(backend, path, arguments) for backend in BACKENDS]},
+            "players": {"rows": []},
         }
-    record.write_result(arguments, wp.get_device("cpu"), result)
+        for backend in BACKENDS:
+            result["players"]["rows"].append(measure(backend, path, arguments))
+            record.write_result(arguments, wp.get_device("cpu"), result)
     return 0
 
 

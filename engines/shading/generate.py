@@ -81,7 +81,7 @@ def with_kernel(source: str, hooks: Mapping[str, str]) -> str:
         lines.append(f"{declaration} {{ return {value(declaration.split()[0])}; }}")
     lines += ['[shader("compute")] [numthreads(1, 1, 1)] void kernelOfAll()', "{"]
     for _, kind, name, parameters in FUNCTION.findall(source):
-        call = f"{name}({', '.join(value(each.split()[0]) for each in parameters.split(','))})"
+        call = f"{name}({', '.join(value(each.split()[0]) for each in parameters.split(',') if each)})"
         first = f".{structs[kind][0][1]}" if kind in structs else ""
         lines.append(f"    data[0].x += float(({call}){first}.x);")
     return source + "\n".join([*lines, "}", ""])

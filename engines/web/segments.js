@@ -11,7 +11,7 @@ import {inWorker} from "./environment.js";
 const RETRY_MS = 2000, MOST_LOADING = 3;
 
 export class Segments {
-  #here = new Map(); #loading = new Map(); #failed = new Map(); #worker = inWorker(unpacking); #isEnded = false;
+  #here = new Map(); #loading = new Map(); #failed = new Map(); #worker; #isEnded = false;
   /** Numbers of the segment that is asked for, and of the one whose frame is shown. */
   wanted = 0; shown = null;
   /** How long the last segment took to be fetched, unpacked, and brought to the GPU [ms]. */
@@ -23,8 +23,10 @@ export class Segments {
    * @param {{most: number, store: Function, free: Function, tell: Function}} owner `store(number, entry, tracks)` resolves to
    *     a segment, which has `bytes` on the GPU; `free(segment)` gives it back; `most` is how many bytes are kept;
    *     `tell(type, detail)` says what has stalled, and what has resumed.
+   * @param {{ask: Function, end: Function}} [worker] What unpacks blocks.
    */
-  constructor(take, owner) {
+  constructor(take, owner, worker = inWorker(unpacking)) {
+    this.#worker = worker;
     Object.assign(this, {take, ...owner, count: take.manifest.segments.length});
   }
 

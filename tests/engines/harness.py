@@ -217,7 +217,8 @@ def packed(golden: Golden) -> FloatArray:
         pixels[:, 3] = buffer.sums[:, 8:]
     cloud = golden.shot.cloud
     gaussians = np.zeros((len(cloud), 2, 4), np.float32)
-    gaussians[:, 0, :3], gaussians[:, 0, 3], gaussians[:, 1, :3] = cloud.positions, cloud.ambient_occlusion, cloud.normals
+    gaussians[:, 0, :3], gaussians[:, 0, 3] = cloud.positions, cloud.ambient_occlusion
+    gaussians[:, 1, :3] = cloud.normals
     moments = golden.regions.moments.transpose(1, 0, 2).reshape(-1, 4) if golden.regions else np.zeros((0, 4))
     levels = prefiltered(golden.shot.environment)
     parts = {

@@ -1,8 +1,8 @@
 """Probes for engines: assets, lights and cameras, and what beam_warp's deferred renderer makes of them on the CPU.
 
 `goldens` returns cases; each has everything that an engine needs to draw the same picture, and the picture. Nothing is
-kept in files: a case takes about a second. Bounces are off, and so are environment shadows unless `REGIONS` are asked for:
-ambient occlusion and specular occlusion stand for them.
+kept in files: a case takes about a second. Bounces are off, and so are environment shadows unless `REGIONS` are asked
+for: ambient occlusion and specular occlusion stand for them.
 
     for golden in goldens(["tripod"], ["studio", "spot"]):
         golden.shot                           # cloud, camera, environment and its rotation, lights
@@ -163,8 +163,8 @@ class Buffer:
     """What ordered blending leaves of every pixel, row by row.
 
     Attributes:
-        sums: Base colour, roughness, ambient occlusion and normal, weighted by visibility, ``(P, 8)``; with regions also
-            what arrives and its share, ``(P, 12)``.
+        sums: Base colour, roughness, ambient occlusion and normal, weighted by visibility, ``(P, 8)``; with regions
+            also what arrives and its share, ``(P, 12)``.
         alpha: Sum of weights, ``(P,)``.
         depth: Depth of the surface [m], ``(P,)``: the lesser of mean and median.
     """

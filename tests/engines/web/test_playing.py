@@ -228,7 +228,7 @@ window.played = (async () => {
 
 
 def test_a_page_from_a_file_plays_a_take_from_its_bytes(browser, take, tmp_path):
-    order = ("b4d", "gpu", "environment", "lights", "sorting", "shaders", "shading", "relight", "index")
+    order = ("b4d", "gpu", "environment", "lights", "sorting", "segments", "shaders", "shading", "relight", "index")
     sources = json.dumps({name: (MODULE / f"{name}.js").read_text(encoding="utf-8") for name in order})
     text = FILE_PAGE.replace("BYTES", base64.b64encode(take.read_bytes()).decode()).replace("PRELUDE", PRELUDE)
     file = tmp_path / "page.html"

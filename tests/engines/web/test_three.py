@@ -66,7 +66,8 @@ window.stage = async (kind) => {
     }
     renderer.render(scene, camera);
     if (target) { // in linear light, top row first
-      const light = await renderer.readRenderTargetPixelsAsync(target, 0, 0, SIDE, SIDE), pixels = new Uint8Array(light.length);
+      const light = await renderer.readRenderTargetPixelsAsync(target, 0, 0, SIDE, SIDE);
+      const pixels = new Uint8Array(light.length);
       for (let i = 0; i < light.length; i++) {
         const row = Math.floor(i / (4 * SIDE));
         pixels[(SIDE - 1 - 2 * row) * 4 * SIDE + i] = Math.round(255 * (light[i] / 255) ** (1 / 2.2));
