@@ -25,9 +25,9 @@ function whole(value, name, least, most) {
 
 /** Reads ranges of a file at a URL; a server without ranges sends the whole file, of which the range is taken. */
 function rangesOf(url) {
-  return async (name, start, size) => {
+  return async (name, start, size, signal) => {
     const place = name === null ? url : new URL(name, new URL(url, globalThis.location?.href));
-    const answer = await fetch(place, {headers: {Range: `bytes=${start}-${start + size - 1}`}});
+    const answer = await fetch(place, {signal, headers: {Range: `bytes=${start}-${start + size - 1}`}});
     require(answer.ok, `${name ?? url} must be within reach`, answer.status);
     const content = new Uint8Array(await answer.arrayBuffer());
     return answer.status === 206 ? content : content.subarray(start, start + size);
@@ -39,8 +39,8 @@ export class Take {
   /**
    * Open a `.b4d` file or a `manifest.json`.
    * @param {string} url
-   * @param {(name: string|null, start: number, size: number) => Promise<Uint8Array>} [read] Reads a range of the file
-   *     (name null) or of a file beside the manifest; by default with fetch.
+   * @param {(name: string|null, start: number, size: number, signal?: AbortSignal) => Promise<Uint8Array>} [read] Reads a
+   *     range of the file (name null) or of a file beside the manifest; by default with fetch.
    */
   static async open(url, read = rangesOf(url)) {
     const take = Object.assign(new Take(), {read, isArchive: !url.endsWith(".json"), start: 0});
@@ -81,10 +81,11 @@ export class Take {
    * @param {object} entry `manifest.static`, or one of `manifest.segments`.
    * @param {number} frames
    * @param {(block: object) => Promise<object>} [unpack] What `unpacking` returns, perhaps in a worker.
+   * @param {AbortSignal} [signal] Ends the request early.
    */
-  async tracks(entry, frames, unpack = unpacking()) {
+  async tracks(entry, frames, unpack = unpacking(), signal = undefined) {
     const [name, start] = this.isArchive ? [null, this.start + entry.offset] : [entry.file, 0];
-    const packed = await this.read(name, start, entry.bytes);
+    const packed = await this.read(name, start, entry.bytes, signal);
     const {tracks} = await unpack({packed, entry, frames, count: this.manifest.count}).catch((error) => { throw new DeliveryError(error.message); });
     for (const [array, {length}] of Object.entries(tracks)) require(length === COMPONENTS[array], `${entry.file} must hold arrays that are known`, array);
     return tracks;

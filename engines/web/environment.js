@@ -348,7 +348,10 @@ export function inWorker(maker) {
       waiting.set(++last, {resolve, reject});
       worker.postMessage([last, message]);
     }),
-    end: () => worker.terminate(),
+    end: () => {
+      worker.terminate();
+      for (const {reject} of waiting.values()) reject(new Error("the worker was ended"));
+    },
   };
 }
 

@@ -243,8 +243,8 @@ export class Relight extends EventTarget {
   /** Return the segment of a moment, the frame in it, and the share of the next one. */
   #place() {
     const {manifest} = this.#take, blends = manifest.topology === "constant";
-    const at = Math.min(Math.max(this.#time * manifest.rate, 0), manifest.frames - 1), whole = Math.floor(at);
-    const frame = blends || at === whole ? whole : Math.floor(at), number = manifest.segments.findIndex(({first, frames}) => frame < first + frames);
+    const at = Math.min(Math.max(this.#time * manifest.rate, 0), manifest.frames - 1), frame = Math.floor(at);
+    const number = manifest.segments.findIndex(({first, frames}) => frame < first + frames);
     const {first, frames} = manifest.segments[number], local = frame - first;
     let share = blends ? at - frame : 0;
     if (local === frames - 1 && share) { // blends end at the last frame of a segment

@@ -1,8 +1,8 @@
 /**
  * Segments of a take, as they are wanted: fetched, unpacked in a worker, and kept on the GPU within a bound.
  *
- * What is wanted comes first. What follows it is read ahead, one at a time, once it is here; bytes that are not wanted any
- * more when they come are not unpacked. So a seek waits for one block at most that is being unpacked.
+ * What is wanted comes first. What follows it is read ahead, one at a time, once it is here. What is not wanted any more is
+ * not fetched to its end, or not unpacked: a seek waits for one block at most that is being unpacked.
  */
 
 import {unpacking} from "./b4d.js";
@@ -11,7 +11,7 @@ import {inWorker} from "./environment.js";
 const RETRY_MS = 2000, MOST_LOADING = 3;
 
 export class Segments {
-  #here = new Map(); #loading = new Map(); #failed = new Map(); #worker; #isEnded = false;
+  #here = new Map(); #loading = new Map(); #failed = new Map(); #aborts = new Map(); #worker; #isEnded = false;
   /** Numbers of the segment that is asked for, and of the one whose frame is shown. */
   wanted = 0; shown = null;
   /** How long the last segment took to be fetched, unpacked, and brought to the GPU [ms]. */
@@ -58,9 +58,14 @@ export class Segments {
     return (number - this.wanted + this.count) % this.count;
   }
 
+  #isWanted(number) {
+    return !this.#isEnded && this.#after(number) <= this.ahead;
+  }
+
   /** Ask for a segment, and, once it is here, for those that follow. */
   want(number) {
     this.wanted = number;
+    for (const [loading, abort] of this.#aborts) if (!this.#isWanted(loading)) abort.abort();
     this.load(number);
     this.#complain();
     for (let k = 1; k <= this.ahead && !this.#loading.size; k++) this.load((number + k) % this.count);
@@ -82,6 +87,7 @@ export class Segments {
       if (this.#loading.size >= MOST_LOADING) return Promise.race(this.#loading.values()).then(() => null);
       this.#loading.set(number, this.#fetch(number).finally(() => {
         this.#loading.delete(number);
+        this.#aborts.delete(number);
         if (!this.#isEnded) this.want(this.wanted);
       }));
     }
@@ -89,14 +95,16 @@ export class Segments {
   }
 
   async #fetch(number) {
-    const entry = this.take.manifest.segments[number], isWanted = () => !this.#isEnded && this.#after(number) <= this.ahead, times = [performance.now()];
+    const entry = this.take.manifest.segments[number], times = [performance.now()], abort = new AbortController();
+    this.#aborts.set(number, abort);
     try {
       const tracks = await this.take.tracks(entry, entry.frames, async (block) => {
         times.push(performance.now());
-        return isWanted() ? this.#worker.ask(block) : {tracks: {}};
-      });
+        if (!this.#isWanted(number)) abort.abort();
+        return abort.signal.aborted ? {tracks: {}} : this.#worker.ask(block);
+      }, abort.signal);
       times.push(performance.now());
-      if (!isWanted()) return null;
+      if (abort.signal.aborted) return null;
       const segment = await this.store(number, entry, tracks);
       times.push(performance.now());
       if (this.#isEnded) return this.free(segment), null;
@@ -107,7 +115,7 @@ export class Segments {
       this.#forget();
       return segment;
     } catch (error) {
-      if (this.#isEnded) return null;
+      if (abort.signal.aborted) return null;
       this.#failed.set(number, {since: performance.now(), isSaid: false, detail: {segment: number, file: entry.file, error, message: error.message}});
       this.#complain();
       return null;
@@ -138,6 +146,7 @@ export class Segments {
   /** Give everything back. */
   end() {
     this.#isEnded = true;
+    for (const abort of this.#aborts.values()) abort.abort();
     this.#worker.end();
     for (const segment of this.#here.values()) this.free(segment);
     this.#here.clear();

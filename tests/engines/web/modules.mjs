@@ -53,8 +53,8 @@ const jobs = {
     let clock = 0, isSlow = false;
     globalThis.performance = {now: () => clock};
     const entries = Array.from({length: 6}, (_, k) => ({first: 10 * k, frames: 10, file: `${k}`}));
-    const take = {manifest: {segments: entries}, async tracks({file}, _, unpack) {
-      if (isSlow) await new Promise((resolve) => waiting.push(resolve));
+    const take = {manifest: {segments: entries}, async tracks({file}, _, unpack, signal) {
+      if (isSlow) await new Promise((resolve, reject) => { waiting.push(resolve); signal.addEventListener("abort", () => reject(new Error("aborted"))); });
       if (broken.has(Number(file))) throw new Error("out of reach");
       return (await unpack(file)).tracks;
     }};

@@ -202,7 +202,9 @@ def test_segments_are_kept_within_a_bound_and_what_is_not_wanted_any_more_is_not
         {"want": 5},
         {"want": 5, "mends": 5},
         {"want": 5, "passes": 2001},
-        {"want": 1, "slow": True},
+        {"want": 0, "slow": True},
+        {"want": 3},
+        {"want": 0},
         {"want": 3},
         {"flows": True, "slow": False, "nearest": 29},
     ]
@@ -217,10 +219,11 @@ def test_segments_are_kept_within_a_bound_and_what_is_not_wanted_any_more_is_not
     assert found[3]["told"] == [], "it is asked for again after a while"
     assert found[4]["told"] == ["resumed 5"]
     assert len(found[4]["here"]) == 4, "450 bytes hold four"
-    assert 1 not in found[7]["unpacked"]
-    assert found[7]["unpacked"][0] == 3
+    assert [step["told"] for step in found[5:]] == [[]] * 5, "what was given up is no loss"
+    assert found[9]["unpacked"] == [3]
+    assert 3 in found[9]["here"]
     assert max(len(step["here"]) for step in found) <= 4
-    assert found[7]["nearest"][0] == 3
+    assert found[9]["nearest"][0] == 3
     assert [step["here"] for step in tight] == [[0, 1], [3, 4]], "one that is read ahead has to be kept"
 
 
