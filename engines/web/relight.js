@@ -312,12 +312,12 @@ export class Relight extends EventTarget {
     return {heads, terms: terms.flat(), at: {frame: `${number}:${local}:${share}`, segment: number, ...forSorter}};
   }
 
-  /** Return the wanted place; if its segment is not here yet, the nearest one that is here, unless a nearer one is shown. */
+  /** Return the wanted place; if its segment is not here, the nearest one that is (before it if it is lost), unless a nearer one is shown. */
   #placeHere() {
     const place = this.#place(), shown = this.#evaluated?.place, {segments} = this.#take.manifest;
     this.#segments.want(place.number);
     if (this.#segments.has(place.number)) return place;
-    const frame = segments[place.number].first + place.local, near = this.#segments.hasFailed(place.number) ? null : this.#segments.nearest(frame);
+    const frame = segments[place.number].first + place.local, near = this.#segments.nearest(frame, this.#segments.hasFailed(place.number));
     return near && !(shown && Math.abs(segments[shown.number].first + shown.local - frame) <= near.distance) ? near : null;
   }
 

@@ -133,10 +133,11 @@ export class Segments {
     }
   }
 
-  /** Return the place nearest to a frame in the segments that are here, and how many frames it is away; null for none. */
-  nearest(frame) {
+  /** Return the place nearest to a frame in the segments that are here, or in those before it; and how far it is [frame]; or null. */
+  nearest(frame, isBefore = false) {
     let best = null;
     for (const {number, entry: {first, frames}} of this.#here.values()) {
+      if (isBefore && first > frame) continue;
       const local = frame < first ? 0 : Math.min(frame - first, frames - 1), distance = Math.abs(first + local - frame);
       if (!best || distance < best.distance) best = {number, local, share: 0, distance};
     }
