@@ -53,9 +53,7 @@ export class Take {
       take.start = at + size;
       if (take.start > content.length) content = await read(null, 0, take.start);
       content = content.subarray(at, take.start);
-    } else if (content.length === HEAD_BYTES) {
-      content = await read(null, 0, MAX_MANIFEST_BYTES);
-    }
+    } else if (content.length === HEAD_BYTES) content = await read(null, 0, MAX_MANIFEST_BYTES);
     try {
       take.manifest = JSON.parse(new TextDecoder().decode(content));
     } catch (error) {
@@ -121,9 +119,7 @@ function check(said) {
   }
   whole(said.count, "count", 0, FREE_COUNT + said.static.bytes);
   let following = 0;
-  for (const {first, frames} of said.segments) {
-    following = whole(first, "first", following, following) + whole(frames, "frames", 1, MAX_FRAMES);
-  }
+  for (const {first, frames} of said.segments) following = whole(first, "first", following, following) + whole(frames, "frames", 1, MAX_FRAMES);
   whole(said.frames, "frames", Math.max(following, 1), following);
 }
 
@@ -136,7 +132,13 @@ export function unpacking() {
 
   /** Return the whole numbers of a plane: 0, 1, 2, 3, 4 … stand for 0, -1, 1, -2, 2 …. */
   function plane(octets, count, size, isSummed) {
-    const numbers = isSummed || size > 1 ? new Float32Array(count) : new Int8Array(count);
+    if (size === 1 && !isSummed) { // four at a time
+      const words = new Uint32Array(Math.ceil(count / 4));
+      new Uint8Array(words.buffer).set(octets);
+      for (let k = 0; k < words.length; k++) words[k] = ((words[k] >>> 1) & 0x7f7f7f7f) ^ (255 * (words[k] & 0x01010101));
+      return new Int8Array(words.buffer, 0, count);
+    }
+    const numbers = new Float32Array(count);
     for (let i = 0, sum = 0; i < count; i++) {
       let code = octets[i];
       for (let order = 1; order < size; order++) code |= octets[order * count + i] << (8 * order);
@@ -157,12 +159,10 @@ export function unpacking() {
       });
     }
     const components = Object.values(tracks).flat();
-    for (const component of components) {
-      component.planes = component.sizes.map((size, k) => {
-        must(size >= 1 && size <= 4 && at + size * count <= content.length, "it must hold all planes, of 1 to 4 bytes a number", size);
-        return plane(content.subarray(at, at += size * count), count, size, k < component.first);
-      });
-    }
+    for (const component of components) component.planes = component.sizes.map((size, k) => {
+      must(size >= 1 && size <= 4 && at + size * count <= content.length, "it must hold all planes, of 1 to 4 bytes a number", size);
+      return plane(content.subarray(at, at += size * count), count, size, k < component.first);
+    });
     must(at === content.length, "it must be filled by its planes", at);
     return {tracks, transfer: components.flatMap(({planes}) => planes.map(({buffer}) => buffer))};
   }
