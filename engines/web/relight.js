@@ -614,7 +614,7 @@ export class Relight extends EventTarget {
     return [Math.max(middle - radius, 0.01), middle + radius];
   }
 
-  /** Resolves when the moment's segment is here, and all that was drawn last is in order. */
+  /** Resolves when the moment's segment is here, or cannot be read, and all that was drawn last is in order. */
   async ready() {
     require(this.#take, "a take must be open", null);
     for (const segments = this.#segments; segments && segments === this.#segments && !this.#isLost && !this.#isDisposed;) {
@@ -623,7 +623,7 @@ export class Relight extends EventTarget {
       if (segments.has(number) || segments.hasFailed(number)) break;
       await segments.load(number);
     }
-    if (this.#isLost || this.#isDisposed || !this.#segments?.has(this.#place().number)) return;
+    if (this.#isLost || this.#isDisposed || !this.#segments) return;
     this.#advance();
     for (const name of this.#views.keys()) await this.#sort(name, true);
   }
