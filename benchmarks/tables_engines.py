@@ -7,6 +7,8 @@ from typing import Any
 from tables import Row, Rows, cell, table
 
 ENGINES = "engine_shading_cpu.json"
+WEB = "web_player_cpu.json"
+BACKENDS = {"webgl2": "WebGL 2", "webgpu": "WebGPU"}
 
 
 @table("engine_shading", ENGINES)
@@ -16,4 +18,29 @@ def shading(result: Row) -> Rows:
     for row in result["rows"]:
         values = [cell(row["psnr"].get(target), ".0f") for target in ("wgsl", "hlsl", "glsl")]
         rows.append([row["probe"], row["lighting"], *values])
+    return rows
+
+
+@table("web_seeks", WEB)
+def seeks(result: Row) -> Rows:
+    """Return what a seek takes on each backend, by stage."""
+    stages = ("fetch", "unpack", "upload", "sort", "ready", "drawn")
+    rows: list[list[Any]] = [["backend", "seek to what is", *stages]]
+    for row in result["players"]["rows"]:
+        for where, times in (("not at hand", row["cold"]), ("at hand", row["warm"])):
+            cells = ["{:.0f}, {:.0f}".format(*times[stage]) if stage in times else "" for stage in stages]
+            rows.append([BACKENDS[row["name"]], where, *cells])
+    return rows
+
+
+@table("web_memory", WEB)
+def memory(result: Row) -> Rows:
+    """Return how a take plays on each backend, and what it holds."""
+    kinds = {"heap_mb": "heap", "page_mb": "page's process", "gpu_mb": "drawing process", "texture_mb": "textures"}
+    rows: list[list[Any]] = [["backend", "pictures a second", "late", "of", "held [MB]", "grows [MB a minute]"]]
+    for row in result["players"]["rows"]:
+        head = [BACKENDS[row["name"]], cell(row["pictures_a_second"]), f"{100 * row['late_share']:.1f} %"]
+        for name, said in kinds.items():
+            rows.append([*head, said, cell(row["held"][name]), "{:.3f} ± {:.3f}".format(*row["growth"][name])])
+            head = [""] * len(head)
     return rows

@@ -4,7 +4,7 @@
 
 Needs ``slangc`` of the package slangtorch (Apache 2.0). slangc emits what an entry point reaches, so a kernel that
 calls every function is added, and cut out again; numbers that slangc appends to names of functions, structs and members
-go. The five functions that an engine defines (`HOOKS`) are declared in C-like languages, and otherwise left open; what
+go. The functions that an engine defines (`HOOKS`) are declared in C-like languages, and otherwise left open; what
 calls them stands in a part of its own.
 """
 
@@ -32,6 +32,8 @@ HOOKS = {
     "environmentRows": "int environmentRows(int level)",
     "environmentTexel": "float3 environmentTexel(int level, int2 cell)",
     "albedoTexel": "float2 albedoTexel(int2 cell)",
+    "regionCount": "int regionCount()",
+    "regionAt": "Region regionAt(int k)",
 }
 """Functions that an engine defines, and their declarations."""
 
@@ -79,7 +81,7 @@ def with_kernel(source: str, hooks: Mapping[str, str]) -> str:
         lines.append(f"{declaration} {{ return {value(declaration.split()[0])}; }}")
     lines += ['[shader("compute")] [numthreads(1, 1, 1)] void kernelOfAll()', "{"]
     for _, kind, name, parameters in FUNCTION.findall(source):
-        call = f"{name}({', '.join(value(each.split()[0]) for each in parameters.split(','))})"
+        call = f"{name}({', '.join(value(each.split()[0]) for each in parameters.split(',') if each)})"
         first = f".{structs[kind][0][1]}" if kind in structs else ""
         lines.append(f"    data[0].x += float(({call}){first}.x);")
     return source + "\n".join([*lines, "}", ""])

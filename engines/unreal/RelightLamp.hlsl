@@ -40,72 +40,72 @@ struct BeamRelight
         return 0.03999999910593033f * albedoTerms_0.x + albedoTerms_0.y;
     }
 
-    float3 lightNormal(Surface surface_4)
+    float3 lightNormal(Surface surface_5)
     {
-        float3 normal_2 = seenNormal(surface_4.normal, surface_4.view);
-        float away_1 = 0.00100000004749745f - dot(normal_2, surface_4.view);
-        float3 _S27;
+        float3 normal_3 = seenNormal(surface_5.normal, surface_5.view);
+        float away_1 = 0.00100000004749745f - dot(normal_3, surface_5.view);
+        float3 _S29;
         if(away_1 > 0.0f)
         {
-            _S27 = normalize(normal_2 + away_1 * surface_4.view);
+            _S29 = normalize(normal_3 + away_1 * surface_5.view);
         }
         else
         {
-            _S27 = normal_2;
+            _S29 = normal_3;
         }
-        return _S27;
+        return _S29;
     }
 
-    float lightCosine(Surface surface_5)
+    float lightCosine(Surface surface_6)
     {
-        return dot(lightNormal(surface_5), surface_5.view);
+        return dot(lightNormal(surface_6), surface_6.view);
     }
 
-    float discCosine(LightDisc disc_1, float3 normal_3)
+    float discCosine(LightDisc disc_1, float3 normal_4)
     {
-        float middle_0 = dot(normal_3, disc_1.direction);
-        float width_1 = 0.86602538824081421f * disc_1.sine * sqrt(max(1.0f - middle_0 * middle_0, 0.0f));
-        if((abs(middle_0)) < width_1)
+        float middle_1 = dot(normal_4, disc_1.direction);
+        float width_1 = 0.86602538824081421f * disc_1.sine * sqrt(max(1.0f - middle_1 * middle_1, 0.0f));
+        if((abs(middle_1)) < width_1)
         {
-            float _S28 = middle_0 + width_1;
-            return _S28 * _S28 / (4.0f * width_1);
+            float _S30 = middle_1 + width_1;
+            return _S30 * _S30 / (4.0f * width_1);
         }
-        return max(middle_0, 0.0f);
+        return max(middle_1, 0.0f);
     }
 
-    float specularBrdf(float3 normal_4, float3 view_2, float3 light_0, float alpha_1)
+    float specularBrdf(float3 normal_5, float3 view_2, float3 light_0, float alpha_1)
     {
-        float nDotV_1 = dot(normal_4, view_2);
-        float nDotL_0 = dot(normal_4, light_0);
-        bool _S29;
+        float nDotV_1 = dot(normal_5, view_2);
+        float nDotL_0 = dot(normal_5, light_0);
+        bool _S31;
         if(nDotV_1 > 0.0f)
         {
-            _S29 = nDotL_0 > 0.0f;
+            _S31 = nDotL_0 > 0.0f;
         }
         else
         {
-            _S29 = false;
+            _S31 = false;
         }
-        if(!_S29)
+        if(!_S31)
         {
             return 0.0f;
         }
-        float3 middle_1 = normalize(view_2 + light_0);
-        float nDotH_0 = dot(normal_4, middle_1);
+        float3 middle_2 = normalize(view_2 + light_0);
+        float nDotH_0 = dot(normal_5, middle_2);
         float a2_0 = alpha_1 * alpha_1;
         float d_2 = nDotH_0 * nDotH_0 * (a2_0 - 1.0f) + 1.0f;
-        float _S30 = 1.0f - a2_0;
-        float m_0 = clamp(1.0f - dot(view_2, middle_1), 0.0f, 1.0f);
-        return a2_0 / (3.14159274101257324f * d_2 * d_2) * (0.5f / max(nDotV_1 * sqrt(nDotL_0 * nDotL_0 * _S30 + a2_0) + nDotL_0 * sqrt(nDotV_1 * nDotV_1 * _S30 + a2_0), 9.999999960041972e-13f)) * (0.03999999910593033f + 0.95999997854232788f * m_0 * m_0 * m_0 * m_0 * m_0);
+        float _S32 = 1.0f - a2_0;
+        float m_0 = clamp(1.0f - dot(view_2, middle_2), 0.0f, 1.0f);
+        return a2_0 / (3.14159274101257324f * d_2 * d_2) * (0.5f / max(nDotV_1 * sqrt(nDotL_0 * nDotL_0 * _S32 + a2_0) + nDotL_0 * sqrt(nDotV_1 * nDotV_1 * _S32 + a2_0), 9.999999960041972e-13f)) * (0.03999999910593033f + 0.95999997854232788f * m_0 * m_0 * m_0 * m_0 * m_0);
     }
 
-    float3 lightRadiance(Surface surface_6, LightDisc disc_2, float2 albedoTerms_2)
+    float3 lightRadiance(Surface surface_7, LightDisc disc_2, float2 albedoTerms_3)
     {
-        float3 normal_5 = lightNormal(surface_6);
+        float3 normal_6 = lightNormal(surface_7);
         float widening_0 = 0.5f * disc_2.sine;
-        float _S31 = surface_6.roughness;
-        float _S32 = max(_S31 * _S31, 0.00100000004749745f);
-        return (surface_6.baseColor * ((1.0f - specularAlbedo(albedoTerms_2)) / 3.14159274101257324f * discCosine(disc_2, normal_5)) + specularBrdf(normal_5, surface_6.view, disc_2.direction, max(sqrt(_S32 * _S32 + widening_0 * widening_0), 0.00100000004749745f)) * max(dot(normal_5, disc_2.direction), 0.0f)) * disc_2.irradiance;
+        float _S33 = surface_7.roughness;
+        float _S34 = max(_S33 * _S33, 0.00100000004749745f);
+        return (surface_7.baseColor * ((1.0f - specularAlbedo(albedoTerms_3)) / 3.14159274101257324f * discCosine(disc_2, normal_6)) + specularBrdf(normal_6, surface_7.view, disc_2.direction, max(sqrt(_S34 * _S34 + widening_0 * widening_0), 0.00100000004749745f)) * max(dot(normal_6, disc_2.direction), 0.0f)) * disc_2.irradiance;
     }
 };
 

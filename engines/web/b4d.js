@@ -7,7 +7,7 @@
  */
 
 const MANIFEST = "manifest.json", HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26;
-const FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30, LARGEST = 1e6;
+const FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30;
 const COMPONENTS = {positions: 3, orientations: 3, turns: 3, scales: 3, opacities: 1, base_color: 3, roughness: 1, ambient_occlusion: 1, normals: 3};
 for (let k = 0; k < 25; k++) COMPONENTS[`radiance_${k}`] = 3;
 
@@ -25,9 +25,9 @@ function whole(value, name, least, most) {
 
 /** Reads ranges of a file at a URL; a server without ranges sends the whole file, of which the range is taken. */
 function rangesOf(url) {
-  return async (name, start, size) => {
+  return async (name, start, size, signal) => {
     const place = name === null ? url : new URL(name, new URL(url, globalThis.location?.href));
-    const answer = await fetch(place, {headers: {Range: `bytes=${start}-${start + size - 1}`}});
+    const answer = await fetch(place, {signal, headers: {Range: `bytes=${start}-${start + size - 1}`}});
     require(answer.ok, `${name ?? url} must be within reach`, answer.status);
     const content = new Uint8Array(await answer.arrayBuffer());
     return answer.status === 206 ? content : content.subarray(start, start + size);
@@ -39,8 +39,8 @@ export class Take {
   /**
    * Open a `.b4d` file or a `manifest.json`.
    * @param {string} url
-   * @param {(name: string|null, start: number, size: number) => Promise<Uint8Array>} [read] Reads a range of the file
-   *     (name null) or of a file beside the manifest; by default with fetch.
+   * @param {(name: string|null, start: number, size: number, signal?: AbortSignal) => Promise<Uint8Array>} [read] Reads a
+   *     range of the file (name null) or of a file beside the manifest; by default with fetch.
    */
   static async open(url, read = rangesOf(url)) {
     const take = Object.assign(new Take(), {read, isArchive: !url.endsWith(".json"), start: 0});
@@ -53,9 +53,7 @@ export class Take {
       take.start = at + size;
       if (take.start > content.length) content = await read(null, 0, take.start);
       content = content.subarray(at, take.start);
-    } else if (content.length === HEAD_BYTES) {
-      content = await read(null, 0, MAX_MANIFEST_BYTES);
-    }
+    } else if (content.length === HEAD_BYTES) content = await read(null, 0, MAX_MANIFEST_BYTES);
     try {
       take.manifest = JSON.parse(new TextDecoder().decode(content));
     } catch (error) {
@@ -76,17 +74,19 @@ export class Take {
     return Take.open("bytes.b4d", async (_, start, size) => new Uint8Array(await part(start, size)));
   }
 
-  /** Return the arrays of a block, after one request; `entry` is `manifest.static` or one of `manifest.segments`. */
-  async tracks(entry, frames) {
+  /**
+   * Return the arrays of a block, after one request.
+   * @param {object} entry `manifest.static`, or one of `manifest.segments`.
+   * @param {number} frames
+   * @param {(block: object) => Promise<object>} [unpack] What `unpacking` returns, perhaps in a worker.
+   * @param {AbortSignal} [signal] Ends the request early.
+   */
+  async tracks(entry, frames, unpack = unpacking(), signal = undefined) {
     const [name, start] = this.isArchive ? [null, this.start + entry.offset] : [entry.file, 0];
-    const packed = await this.read(name, start, entry.bytes);
-    require(packed.length === entry.bytes, `${entry.file} must have ${entry.bytes} bytes`, packed.length);
-    if (globalThis.crypto?.subtle) { // pages from http have none
-      const digest = await crypto.subtle.digest("SHA-256", packed);
-      const digits = Array.from(new Uint8Array(digest), (byte) => byte.toString(16).padStart(2, "0")).join("");
-      require(digits === entry.sha256, `${entry.file} must have the digest that ${MANIFEST} says`, digits);
-    }
-    return split(await inflated(packed, entry), entry.file, frames, this.manifest.count);
+    const packed = await this.read(name, start, entry.bytes, signal);
+    const {tracks} = await unpack({packed, entry, frames, count: this.manifest.count}).catch((error) => { throw new DeliveryError(error.message); });
+    for (const [array, {length}] of Object.entries(tracks)) require(length === COMPONENTS[array], `${entry.file} must hold arrays that are known`, array);
+    return tracks;
   }
 
   /** Return a frame; its segment is fetched and unpacked if it is not the one of the last call. */
@@ -119,68 +119,73 @@ function check(said) {
   }
   whole(said.count, "count", 0, FREE_COUNT + said.static.bytes);
   let following = 0;
-  for (const {first, frames} of said.segments) {
-    following = whole(first, "first", following, following) + whole(frames, "frames", 1, MAX_FRAMES);
-  }
+  for (const {first, frames} of said.segments) following = whole(first, "first", following, following) + whole(frames, "frames", 1, MAX_FRAMES);
   whole(said.frames, "frames", Math.max(following, 1), following);
 }
 
-async function inflated(packed, entry) {
-  const reader = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate")).getReader();
-  const content = new Uint8Array(entry.unpacked);
-  let end = 0;
-  try {
-    for (let part; !(part = await reader.read()).done; end += part.value.length) content.set(part.value, end);
-  } catch (error) { // a damaged stream, or more than the manifest says
-    throw new DeliveryError(`${entry.file} must unpack to ${entry.unpacked} bytes, got ${error.message}.`);
-  }
-  require(end === entry.unpacked, `${entry.file} must unpack to ${entry.unpacked} bytes`, end);
-  return content;
-}
+/**
+ * Return the function that unpacks a block, given its bytes, its entry in the manifest, its number of frames, and of
+ * Gaussians. A worker can run this one: it uses nothing outside of itself. `transfer` lists the memory of the answer.
+ */
+export function unpacking() {
+  const must = (condition, contract, got) => { if (!condition) throw new Error(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
-function split(content, file, frames, count) {
-  const tracks = {};
-  let at = 4 + new DataView(content.buffer).getUint32(0, true);
-  try {
-    const {arrays} = JSON.parse(new TextDecoder().decode(content.subarray(4, at)));
-    for (const {name, planes} of arrays) {
-      require(planes.length === COMPONENTS[name], `${file} must hold arrays that are known`, name);
+  /** Return the whole numbers of a plane: 0, 1, 2, 3, 4 … stand for 0, -1, 1, -2, 2 …. Loops that meet one kind of array are fast. */
+  function plane(octets, count, size, isSummed) {
+    if (size === 1 && !isSummed) { // four at a time
+      const words = new Uint32Array(Math.ceil(count / 4));
+      new Uint8Array(words.buffer).set(octets);
+      for (let k = 0; k < words.length; k++) words[k] = ((words[k] >>> 1) & 0x7f7f7f7f) ^ (255 * (words[k] & 0x01010101));
+      return new Int8Array(words.buffer, 0, count);
+    }
+    const [a, b, c, d] = [0, 1, 2, 3].map((k) => (k < size ? octets.subarray(k * count) : new Uint8Array(count)));
+    const numbers = new Float32Array(count), kept = isSummed ? -1 : 0; // all bits of the sum so far, or none
+    for (let i = 0, sum = 0; i < count; i++) {
+      const code = a[i] | b[i] << 8 | c[i] << 16 | d[i] << 24;
+      numbers[i] = sum = ((sum & kept) + ((code >>> 1) ^ -(code & 1))) | 0;
+    }
+    return numbers;
+  }
+
+  function split(content, frames, count) {
+    const tracks = {};
+    let at = 4 + new DataView(content.buffer).getUint32(0, true);
+    for (const {name, planes} of JSON.parse(new TextDecoder().decode(content.subarray(4, at))).arrays) {
       tracks[name] = planes.map(([summed, plain]) => {
-        const columns = 1 + summed.length + plain.length;
-        const weights = new Float32Array(content.slice(at, at += 4 * frames * columns).buffer);
-        require(weights.every((w) => Math.abs(w) <= LARGEST), `${file}: weights must be at most ${LARGEST}`, name);
+        const columns = 1 + summed.length + plain.length, weights = new Float32Array(content.slice(at, at += 4 * frames * columns).buffer);
+        must(weights.every((w) => Math.abs(w) <= 1e6), "weights must be at most 1e6", name);
         return {sizes: [...summed, ...plain], first: summed.length, columns, weights};
       });
     }
-    for (const component of Object.values(tracks).flat()) {
-      component.planes = component.sizes.map((size, k) => {
-        require(at + size * count <= content.length, `${file} must hold all planes`, content.length);
-        return plane(content.subarray(at, at += size * count), count, size, k < component.first);
-      });
+    const components = Object.values(tracks).flat();
+    for (const component of components) component.planes = component.sizes.map((size, k) => {
+      must(size >= 1 && size <= 4 && at + size * count <= content.length, "it must hold all planes, of 1 to 4 bytes a number", size);
+      return plane(content.subarray(at, at += size * count), count, size, k < component.first);
+    });
+    must(at === content.length, "it must be filled by its planes", at);
+    return {tracks, transfer: components.flatMap(({planes}) => planes.map(({buffer}) => buffer))};
+  }
+
+  return async ({packed, entry: {file, bytes, unpacked, sha256}, frames, count}) => {
+    must(packed.length === bytes, `${file} must have ${bytes} bytes`, packed.length);
+    if (globalThis.crypto?.subtle) { // pages from http have none
+      const digits = Array.from(new Uint8Array(await crypto.subtle.digest("SHA-256", packed)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+      must(digits === sha256, `${file} must have the digest that the manifest says`, digits);
     }
-    require(at === content.length, `${file} must be filled by its planes`, at);
-  } catch (error) {
-    throw error instanceof DeliveryError ? error : new DeliveryError(`${file} must be a sound block, got ${error.message}.`);
-  }
-  return tracks;
-}
-
-/** Return the whole numbers of a plane: 0, 1, 2, 3, 4 … stand for 0, -1, 1, -2, 2 …. Loops that meet one kind of array are fast. */
-function plane(octets, count, size, isSummed) {
-  require(size >= 1 && size <= 4, "planes must have 1 to 4 bytes", size);
-  if (size > 1 || isSummed) return unfolded([0, 1, 2, 3].map((k) => (k < size ? octets.subarray(k * count) : new Uint8Array(count))), isSummed ? -1 : 0, count);
-  const numbers = new Int8Array(count);
-  for (let i = 0; i < count; i++) numbers[i] = (octets[i] >>> 1) ^ -(octets[i] & 1);
-  return numbers;
-}
-
-function unfolded([a, b, c, d], kept, count) { // kept: all bits of the sum so far, or none
-  const numbers = new Float32Array(count);
-  for (let i = 0, sum = 0; i < count; i++) {
-    const code = a[i] | b[i] << 8 | c[i] << 16 | d[i] << 24;
-    numbers[i] = sum = ((sum & kept) + ((code >>> 1) ^ -(code & 1))) | 0;
-  }
-  return numbers;
+    const reader = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate")).getReader(), content = new Uint8Array(unpacked);
+    let end = 0;
+    try {
+      for (let part; !(part = await reader.read()).done; end += part.value.length) content.set(part.value, end);
+    } catch (error) { // a damaged stream, or more than the manifest says
+      throw new Error(`${file} must unpack to ${unpacked} bytes, got ${error.message}.`);
+    }
+    must(end === unpacked, `${file} must unpack to ${unpacked} bytes`, end);
+    try {
+      return split(content, frames, count);
+    } catch (error) {
+      throw new Error(`${file} must be a sound block, got: ${error.message}`);
+    }
+  };
 }
 
 /** Return offset plus weights times planes for each component, plus what the static block says. */

@@ -253,8 +253,60 @@ export function prefilterWorker() {
     return table;
   }
 
-  return ({map, most}) => {
+  /** Cut a map into regions of equal power, as beam_warp.light.regions does: where each is, how wide, and its moments. */
+  function regionsOf(map, count) {
+    const {height: rows, radiance} = resized(map, Math.min(map.height, 256)), columns = 2 * rows;
+    const power = new Float64Array(rows * columns), angleOf = (y) => PI / rows * (Math.cos(PI * y / rows) - Math.cos(PI * (y + 1) / rows));
+    const weigh = (isDark) => power.forEach((_, i) => {
+      const light = 0.2126 * radiance[3 * i] + 0.7152 * radiance[3 * i + 1] + 0.0722 * radiance[3 * i + 2];
+      power[i] = (isDark ? 1 : light) * angleOf(Math.floor(i / columns));
+    });
+    weigh(false);
+    if (!power.some((value) => value > 0)) weigh(true);
+    const each = ([top, bottom, left, right], visit) => { for (let y = top; y < bottom; y++) for (let x = left; x < right; x++) visit(y * columns + x, y, x); };
+    const halves = (box) => {
+      const [top, bottom, left, right] = box, tall = bottom - top, wide = right - left;
+      let across = wide * Math.sin(PI * 0.5 * (top + bottom) / rows) > tall;
+      if ((across ? wide : tall) < 2) across = wide > tall;
+      const sums = new Float64Array(across ? wide : tall);
+      each(box, (i, y, x) => { sums[across ? x - left : y - top] += power[i]; });
+      if (sums.length < 2) return [box, [bottom, bottom, left, right]];
+      for (let k = 1; k < sums.length; k++) sums[k] += sums[k - 1];
+      const half = 0.5 * sums.at(-1);
+      let cut = 0;
+      for (let k = 1; k < sums.length - 1; k++) if (Math.abs(sums[k] - half) < Math.abs(sums[cut] - half)) cut = k;
+      const [at, from] = [cut + 1, across ? left : top];
+      return across ? [[top, bottom, left, from + at], [top, bottom, from + at, right]] : [[top, from + at, left, right], [from + at, bottom, left, right]];
+    };
+    let boxes = [[0, rows, 0, columns]];
+    while (boxes.length < count) boxes = boxes.flatMap(halves);
+    return boxes.map((box) => {
+      let total = 0, inside = 0, isLit = false;
+      const mean = [0, 0, 0], flux = [0, 0, 0], sums = [[0, 0, 0], [0, 0, 0], [0, 0, 0]];
+      each(box, (i) => { inside++; isLit ||= power[i] > 0; });
+      each(box, (i, y, x) => {
+        const d = directionOf(y, x, rows), weight = isLit ? power[i] : 1, angle = angleOf(y);
+        total += weight;
+        for (let k = 0; k < 3; k++) mean[k] += weight * d[k];
+        for (let c = 0; c < 3; c++) {
+          const light = radiance[3 * i + c] * angle;
+          flux[c] += light;
+          for (let k = 0; k < 3; k++) sums[c][k] += light * d[k];
+        }
+      });
+      const length = Math.hypot(...mean), direction = length > 1e-9 * Math.max(total, 1e-300) ? mean.map((value) => value / length) : [0, 0, 1];
+      const cosine = inside ? (mean[0] * direction[0] + mean[1] * direction[1] + mean[2] * direction[2]) / total : 1;
+      const moments = sums.map((sum, c) => {
+        const size = Math.hypot(...sum);
+        return [...sum, size * Math.sqrt(3 * Math.max(1 - size / Math.max(flux[c], 1e-300), 0))];
+      });
+      return {direction, halfAngle: Math.acos(Math.min(Math.max(2 * cosine - 1, Math.cos(75 * PI / 180)), 1)), moments};
+    });
+  }
+
+  return ({map, most, regions}) => {
     if (!map) return {albedo: albedoTable()};
+    if (regions) return {regions: regionsOf(map, regions)};
     const tree = treeOf(map), finest = Math.min(MAX_TREE_ROWS, Math.max(32, 2 * map.height));
     const first = map.height > most ? resized(map, most) : map;
     const levels = roughnesses.map((roughness) => {
@@ -266,12 +318,16 @@ export function prefilterWorker() {
   };
 }
 
-/** Run a function that returns a handler in a worker, or here if workers are refused; returns {ask(message, transfer), end()}. */
+/**
+ * Run a function that returns a handler in a worker, or here if workers are refused; returns {ask(message), end()}. Memory
+ * that an answer lists as `transfer` is handed over, not copied.
+ */
 export function inWorker(maker) {
   let worker;
   try {
-    const source = `const handle = (${maker})(); onmessage = ({data: [number, message]}) => {
-      try { postMessage([number, handle(message)]); } catch (error) { postMessage([number, null, String(error)]); } };`;
+    const source = `const handle = (${maker})(); onmessage = async ({data: [number, message]}) => {
+      try { const answer = await handle(message); postMessage([number, answer], answer?.transfer ?? []); }
+      catch (error) { postMessage([number, null, String(error?.message || error)]); } };`;
     const url = URL.createObjectURL(new Blob([source], {type: "text/javascript"}));
     worker = new Worker(url);
     URL.revokeObjectURL(url);
@@ -288,11 +344,14 @@ export function inWorker(maker) {
     else resolve(answer);
   };
   return {
-    ask: (message, transfer = []) => new Promise((resolve, reject) => {
+    ask: (message) => new Promise((resolve, reject) => {
       waiting.set(++last, {resolve, reject});
-      worker.postMessage([last, message], transfer);
+      worker.postMessage([last, message]);
     }),
-    end: () => worker.terminate(),
+    end: () => {
+      worker.terminate();
+      for (const {reject} of waiting.values()) reject(new Error("the worker was ended"));
+    },
   };
 }
 
@@ -312,6 +371,13 @@ export class Environment {
   /** Blur a map: `{height, radiance}`, Float32Array of RGB, twice as wide as high. */
   static async of(map) {
     return Environment.made({map: {height: map.height, radiance: map.radiance}, most: MAX_ROWS});
+  }
+
+  /** Return a number of regions of equal power: `{direction, halfAngle, moments}` each, in the environment's own axes. */
+  async regions(count) {
+    this.cuts ??= {};
+    this.cuts[count] ??= Environment.made({map: this.maps[1], regions: count}).then(({regions}) => regions);
+    return this.cuts[count];
   }
 
   /** Return light of one radiance from everywhere; without arguments, darkness. */

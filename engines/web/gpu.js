@@ -218,7 +218,7 @@ export class WebGPU {
       features = device.features;
     }
     const gpu = Object.assign(new WebGPU(), {device, canvas, name: "webgpu", made: new Set(),
-      blendFormat: features.has("float32-blendable") && device.limits.maxColorAttachmentBytesPerSample >= 48 ? "rgba32float" : "rgba16float"});
+      blendFormat: features.has("float32-blendable") && device.limits.maxColorAttachmentBytesPerSample >= 64 ? "rgba32float" : "rgba16float"});
     gpu.context = canvas?.getContext("webgpu");
     if (canvas && !gpu.context) throw new GpuError("the canvas must be free for WebGPU, got one with another context. Make a new one.");
     gpu.format = canvas ? navigator.gpu.getPreferredCanvasFormat() : "rgba8unorm";

@@ -66,14 +66,16 @@ function viewOf(position, axis, halfAngle, size, radius, front) {
   return {position, right, down: cross(forward, right), forward, focal: [focal, focal], center: [size / 2, size / 2], width: size, height: size, radius, front};
 }
 
+/** Return the view of a distant light's map: a unit vector to the light, and half the angle that its disc takes up [rad]. */
+export function distantView(towards, halfAngle, casters, size) {
+  const distance = FAR * casters.radius, position = minus(casters.center, scaled(towards, -distance)), radius = distance * Math.tan(halfAngle);
+  return viewOf(position, scaled(towards, -1), Math.asin(ROOM / FAR), size, radius, distance - ROOM * casters.radius);
+}
+
 /** Return the views of a lamp's maps: none, one, or the six of a cube; `casters` is the sphere around the subject. */
 export function shadowViews(light, casters, size) {
   if (!light.casts_shadows) return [];
-  if (light.type === "directional") {
-    const distance = FAR * casters.radius, position = minus(casters.center, scaled(light.direction, distance));
-    const radius = distance * Math.tan(light.angular_diameter * RADIAN / 2);
-    return [viewOf(position, light.direction, Math.asin(ROOM / FAR), size, radius, distance - ROOM * casters.radius)];
-  }
+  if (light.type === "directional") return [distantView(scaled(light.direction, -1), light.angular_diameter * RADIAN / 2, casters, size)];
   const toCasters = minus(casters.center, light.position), distance = Math.hypot(...toCasters), extent = ROOM * casters.radius;
   const cone = light.type === "spot" ? light.outer_angle * RADIAN : Math.PI;
   let axis = toCasters, half = distance > extent ? Math.asin(extent / distance) : Math.PI;

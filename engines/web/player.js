@@ -21,12 +21,17 @@ const ASK_FOR_FILE = "Choose the .b4d file here, or serve the folder: python3 -m
 /** Return the function that reads ranges of a take that a page holds as base64. */
 function rangesOfText(text) {
   return async (name, start, size) => {
-    const first = Math.floor(start / 3), packed = atob(text.slice(4 * first, 4 * Math.ceil((start + size) / 3)));
-    return Uint8Array.from(packed, (letter) => letter.charCodeAt(0)).subarray(start - 3 * first, start - 3 * first + size);
+    const first = Math.floor(start / 3), bytes = bytesOf(text.slice(4 * first, 4 * Math.ceil((start + size) / 3)));
+    return bytes.subarray(start - 3 * first, start - 3 * first + size);
   };
 }
 
-const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+/** Return the bytes of base64, by a loop: `Uint8Array.from` would take 0.2 s for a segment. */
+function bytesOf(base64) {
+  const packed = atob(base64), bytes = new Uint8Array(packed.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = packed.charCodeAt(i);
+  return bytes;
+}
 
 /** Start the player in an element; `settings` is what `converters/player.py` writes. */
 export async function start(root, settings) {

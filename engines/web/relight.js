@@ -12,14 +12,17 @@
 
 import {Environment} from "./environment.js";
 import {GpuError, WebGL2, WebGPU} from "./gpu.js";
-import {checkedLights, depthRow, lampNumbers, mapNumbers, shadowViews} from "./lights.js";
+import {checkedLights, depthRow, distantView, lampNumbers, mapNumbers, shadowViews} from "./lights.js";
+import {Segments} from "./segments.js";
 import * as passes from "./shaders.js";
 import {GLSL, GLSL_FETCHING, WGSL, WGSL_FETCHING} from "./shading.js";
 import {sorter} from "./sorting.js";
 
 const {ROW, ORDER, RADIANCE, CHANNELS, BINS, SEARCHES} = passes;
 const isStored = (name) => name in ORDER || name in RADIANCE;
-const MAX_LAYERS = 256, LAYER_ROWS = 2048, KEPT_SEGMENTS = 3, RETRY_MS = 2000, THICKEST = 0.02;
+const MAX_LAYERS = 256, LAYER_ROWS = 2048, KEPT_BYTES = 2 ** 28, THICKEST = 0.02, REGION_SIDE = 256;
+/** No shadow maps: of lamps, or of regions of the environment. */
+const NO_MAPS = {key: null, views: [], orders: [], drawn: true};
 const SHADOW_FILTERS = [0.1, 0.01, 1, 0];
 /** What stands for arrays that a container lacks. */
 const DEFAULTS = {base_color: [0.5, 0.5, 0.5], roughness: [0.5], ambient_occlusion: [1]};
@@ -51,22 +54,25 @@ const cameraNumbers = (view, count) => ({
 
 /** A renderer of one canvas. Events: sorted, stalled, resumed, lost, restored, error. */
 export class Relight extends EventTarget {
-  #programs; #textures = {}; #sorter; #segments = new Map(); #loading = new Map(); #failed = new Map();
-  #take = null; #time = 0; #evaluated = null; #views = new Map(); #maps = {key: null, views: [], drawn: null}; #casters = null;
-  #environment = null; #lights = []; #lightsVersion = 0; #sorting = null; #isDisposed = false; #isLost = false;
+  #programs; #textures = {}; #sorter; #segments = null; #sortTime = 0;
+  #take = null; #time = 0; #evaluated = null; #views = new Map(); #maps = {lamps: NO_MAPS, regions: NO_MAPS}; #casters = null;
+  #environment = null; #lights = []; #versions = {lights: 0, environment: 0}; #sorting = null; #isDisposed = false; #isLost = false; #isOwn = true;
 
   /**
    * Return a renderer.
    * @param {HTMLCanvasElement|OffscreenCanvas|null} canvas What is drawn on; null to draw pictures that `read` returns.
-   * @param {{backend?: "webgpu"|"webgl2", context?: WebGL2RenderingContext, device?: GPUDevice, shadowMapSize?: number}} [options]
-   *     By default WebGPU if there is any; a context or a device of another renderer, to share textures with it.
+   * @param {{backend?: "webgpu"|"webgl2", context?: WebGL2RenderingContext, device?: GPUDevice, shadowMapSize?: number,
+   *     segmentBytes?: number}} [options] By default WebGPU if there is any; a context or a device of another renderer, to
+   *     share textures with it; how many bytes of segments are kept on the GPU, though never fewer than three segments.
    */
-  static async create(canvas, {backend, context = null, device = null, shadowMapSize = 1024} = {}) {
+  static async create(canvas, {backend, context = null, device = null, shadowMapSize = 1024, segmentBytes = KEPT_BYTES} = {}) {
     require([undefined, "webgpu", "webgl2"].includes(backend), "backend must be webgpu or webgl2", backend);
     require(Number.isInteger(shadowMapSize) && shadowMapSize >= 16 && shadowMapSize <= 8192, "shadowMapSize must be in [16, 8192]", shadowMapSize);
-    const relight = Object.assign(new Relight(), {canvas, shadowMapSize, rotation: 0, environmentGain: 1, exposure: 0, viewTransform: "standard",
-      channel: "relit", background: null, depthRange: null, casters: null});
+    require(segmentBytes >= 0, "segmentBytes must be at least 0", segmentBytes);
+    const relight = Object.assign(new Relight(), {canvas, shadowMapSize, segmentBytes, rotation: 0, environmentGain: 1, exposure: 0, viewTransform: "standard",
+      channel: "relit", background: null, depthRange: null, casters: null, environmentShadows: 0});
     relight.#environment = await Environment.constant();
+    relight.#isOwn = !device;
     await relight.#start(async () => {
       if (backend !== "webgl2" && !context) {
         try {
@@ -104,6 +110,14 @@ export class Relight extends EventTarget {
     });
   }
 
+  /** The same for shadows of the environment. */
+  #regionPrograms() {
+    if (this.#programs.arrive) return;
+    this.#lampPrograms();
+    Object.assign(this.#programs, {arrive: this.gpu.program(passes.arrive({glsl: GLSL + GLSL_FETCHING, wgsl: WGSL + WGSL_FETCHING})),
+      gbufferArriving: this.gpu.program(passes.gbuffer(this.gpu.blendFormat, true))});
+  }
+
   #filled(texel) {
     const texture = this.gpu.texture({width: 1, height: 1, format: "rgba32float"});
     this.gpu.write(texture, new Float32Array(texel));
@@ -139,6 +153,7 @@ export class Relight extends EventTarget {
         this.#tell("error", {error, message: `the GPU must come back, got ${error.message}`});
       }
     };
+    if (!this.#isOwn) return; // whoever gave the device has to give another one
     if (this.backend === "webgpu") again();
     else this.gpu.gl.canvas.addEventListener("webglcontextrestored", again, {once: true});
   }
@@ -146,9 +161,9 @@ export class Relight extends EventTarget {
   /** Give back all memory; the renderer cannot be used any more. */
   dispose() {
     this.#isDisposed = true;
+    this.#segments?.end();
     this.#sorter?.end();
     this.gpu.dispose();
-    this.#segments.clear();
     this.#take = null;
   }
 
@@ -168,22 +183,22 @@ export class Relight extends EventTarget {
     this.still = stored.places;
     for (const name of ["positions", "orientations", "scales", "colors", "normals"]) this.#texture(name, ROW, rows, "rgba32float");
     this.thickness = middleScale(take.still.scales, count);
-    const still = take.raw.positions.slice(0, 3 * count);
-    await this.#sorter.ask({still, opacities: take.still.opacities, count, row: ROW});
+    await this.#sorter.ask({still: take.raw.positions, opacities: take.still.opacities, count, row: ROW});
+    if (take !== this.#take) return;
+    this.#segments = new Segments(take, {most: this.segmentBytes, store: (...given) => this.#bring(...given), free: (segment) => this.#free(segment),
+      tell: (type, detail) => this.#tell(type, detail)});
   }
 
   #close() {
-    for (const segment of this.#segments.values()) this.#free(segment);
-    this.#segments.clear();
-    this.#loading.clear();
-    this.#failed.clear();
+    this.#segments?.end();
+    this.#segments = null;
     for (const view of this.#views.values()) this.gpu.destroy(view.order);
     this.#views.clear();
     for (const name of ["still", "none", "noInts"]) this.gpu.destroy(this.#textures[name]);
     this.#textures.none = this.gpu.texture({width: 1, height: 1, layers: 1, format: "r32float"});
     this.#textures.noInts = this.gpu.texture({width: 1, height: 1, layers: 1, format: "r8sint"});
-    for (const order of this.#maps.orders ?? []) this.gpu.destroy(order);
-    this.#maps = {key: null, views: [], drawn: null};
+    for (const {orders} of Object.values(this.#maps)) for (const order of orders) this.gpu.destroy(order);
+    this.#maps = {lamps: NO_MAPS, regions: NO_MAPS};
     this.#evaluated = this.#casters = null;
   }
 
@@ -228,8 +243,8 @@ export class Relight extends EventTarget {
   /** Return the segment of a moment, the frame in it, and the share of the next one. */
   #place() {
     const {manifest} = this.#take, blends = manifest.topology === "constant";
-    const at = Math.min(Math.max(this.#time * manifest.rate, 0), manifest.frames - 1), whole = Math.floor(at);
-    const frame = blends || at === whole ? whole : Math.floor(at), number = manifest.segments.findIndex(({first, frames}) => frame < first + frames);
+    const at = Math.min(Math.max(this.#time * manifest.rate, 0), manifest.frames - 1), frame = Math.floor(at);
+    const number = manifest.segments.findIndex(({first, frames}) => frame < first + frames);
     const {first, frames} = manifest.segments[number], local = frame - first;
     let share = blends ? at - frame : 0;
     if (local === frames - 1 && share) { // blends end at the last frame of a segment
@@ -239,49 +254,33 @@ export class Relight extends EventTarget {
     return {number, local, share};
   }
 
-  /** Fetch a segment unless it is here; resolves to it, or to null if it cannot be read. */
-  #load(number) {
-    if (this.#segments.has(number)) return Promise.resolve(this.#segments.get(number));
-    if (performance.now() - (this.#failed.get(number) ?? -Infinity) < RETRY_MS) return Promise.resolve(null);
-    if (!this.#loading.has(number)) this.#loading.set(number, this.#fetch(number, this.#take));
-    return this.#loading.get(number);
+  /** Bring a segment to the GPU, and what it says of positions to the sorter. */
+  async #bring(number, entry, tracks) {
+    const named = Object.entries(tracks).filter(([name]) => isStored(name)).flatMap(([name, components]) =>
+      components.flatMap(({planes}, c) => planes.map((values, k) => [`${name}${c}/${k}`, values])));
+    const summed = this.#store(named.filter(([, values]) => values instanceof Float32Array), "float");
+    const plain = this.#store(named.filter(([, values]) => values instanceof Int8Array), "int");
+    const weights = mapped(tracks, (components) => components.map(({columns, weights: all}) => ({columns, weights: all})));
+    await this.#sorter.ask({segment: number, planes: (tracks.positions ?? [[], [], []]).map(({planes = []}) => planes)});
+    return {number, entry, weights, summed: summed.texture, plain: plain.texture, summedPlaces: summed.places, plainPlaces: plain.places,
+      bytes: 4 * texels(summed.texture) + texels(plain.texture)};
   }
 
-  async #fetch(number, take) {
-    const entry = take.manifest.segments[number];
-    try {
-      const tracks = await take.tracks(entry, entry.frames);
-      if (take !== this.#take || this.#isDisposed || this.#isLost) return null;
-      const named = Object.entries(tracks).filter(([name]) => isStored(name)).flatMap(([name, components]) =>
-        components.flatMap(({planes}, c) => planes.map((values, k) => [`${name}${c}/${k}`, values])));
-      const summed = this.#store(named.filter(([, values]) => values instanceof Float32Array), "float");
-      const plain = this.#store(named.filter(([, values]) => values instanceof Int8Array), "int");
-      const weights = mapped(tracks, (components) => components.map(({columns, weights: all}) => ({columns, weights: all})));
-      const segment = {number, entry, weights, summed: summed.texture, plain: plain.texture, summedPlaces: summed.places, plainPlaces: plain.places};
-      await this.#sorter.ask({segment: number, planes: (tracks.positions ?? [[], [], []]).map(({planes = []}) => planes)});
-      if (take !== this.#take) return null;
-      this.#segments.set(number, segment);
-      if (this.#failed.delete(number)) this.#tell("resumed", {segment: number});
-      this.#forget();
-      return segment;
-    } catch (error) {
-      if (take !== this.#take || this.#isDisposed) return null;
-      this.#failed.set(number, performance.now());
-      this.#tell("stalled", {segment: number, file: entry.file, error, message: error.message});
-      return null;
-    } finally {
-      if (take === this.#take) this.#loading.delete(number);
-    }
+  /** Moment that is shown [s]: that of the nearest frame at hand, while the wanted one is on its way; null before the first. */
+  get shownTime() {
+    if (!this.#evaluated) return null;
+    const {segments, rate} = this.#take.manifest, {number, local, share} = this.#evaluated.place;
+    return (segments[number].first + local + share) / rate;
   }
 
-  /** Keep the segments nearest to what is shown. */
-  #forget() {
-    const wanted = this.#place().number, distance = (number) => number >= wanted ? number - wanted : 1.5 * (wanted - number);
-    const shown = this.#evaluated?.place.number, far = [...this.#segments.keys()].filter((number) => number !== shown).sort((a, b) => distance(a) - distance(b)).slice(KEPT_SEGMENTS - 1);
-    for (const number of far) {
-      this.#free(this.#segments.get(number));
-      this.#segments.delete(number);
-    }
+  /** Bytes of segments that are kept on the GPU. */
+  get keptBytes() {
+    return this.#segments?.bytes ?? 0;
+  }
+
+  /** How long the last segment took to be fetched, unpacked and brought to the GPU, and the last order of depth to be found [ms]. */
+  get timings() {
+    return {...this.#segments?.timings, sort: this.#sortTime};
   }
 
   /** Return the sums that give a frame: offsets and terms of every component of arrays, whose places are given. */
@@ -313,13 +312,22 @@ export class Relight extends EventTarget {
     return {heads, terms: terms.flat(), at: {frame: `${number}:${local}:${share}`, segment: number, ...forSorter}};
   }
 
-  /** Evaluate the wanted frame if its segment is here; ask for it and for the next one otherwise. */
+  /** Return the wanted place; if its segment is not here, the nearest one that is (before it if it is lost), unless a nearer one is shown. */
+  #placeHere() {
+    const place = this.#place(), shown = this.#evaluated?.place, {segments} = this.#take.manifest;
+    this.#segments.want(place.number);
+    if (this.#segments.has(place.number)) return place;
+    const frame = segments[place.number].first + place.local, near = this.#segments.nearest(frame, this.#segments.hasFailed(place.number));
+    return near && !(shown && Math.abs(segments[shown.number].first + shown.local - frame) <= near.distance) ? near : null;
+  }
+
+  /** Evaluate the wanted frame, or the nearest one that is here. */
   #advance() {
-    const place = this.#place(), segment = this.#segments.get(place.number), last = this.#take.manifest.segments.length - 1;
-    this.#load(place.number);
-    if (segment && place.number < last && place.local >= segment.entry.frames / 3) this.#load(place.number + 1);
-    const key = `${place.number}:${place.local}:${place.share}`;
-    if (!segment || this.#evaluated?.key === key) return;
+    const place = this.#segments && this.#placeHere();
+    if (!place) return;
+    const segment = this.#segments.get(place.number), key = `${place.number}:${place.local}:${place.share}`;
+    if (this.#evaluated?.key === key) return;
+    this.#segments.shown = place.number;
     const {heads, terms, at} = this.#sums(place), t = this.#textures;
     const textures = {still: t.still, summed: segment.summed ?? t.none, plain: segment.plain ?? t.noInts}, uniforms = {heads, terms};
     for (const [name, targets] of [["geometry", [t.positions, t.orientations]], ["materials", [t.scales, t.colors]], ["normals", [t.normals]]]) {
@@ -338,6 +346,7 @@ export class Relight extends EventTarget {
   set environment(environment) {
     require(environment instanceof Environment, "environment must be an Environment", environment);
     this.#environment = environment;
+    this.#versions.environment++;
     if (!this.#isLost) this.#upload(environment);
   }
 
@@ -368,7 +377,7 @@ export class Relight extends EventTarget {
     const lights = checkedLights(records);
     require(lights.length <= passes.LAMPS, `lights must be at most ${passes.LAMPS}`, lights.length);
     this.#lights = lights;
-    this.#lightsVersion++;
+    this.#versions.lights++;
   }
 
   // ---- Depth order
@@ -377,8 +386,8 @@ export class Relight extends EventTarget {
   #sort(name, exact) {
     if (!this.#evaluated) return Promise.resolve();
     const wanted = () => {
-      const view = this.#views.get(name), key = `${this.#evaluated.key}|${depthRow(view.camera)}`, maps = `${this.#evaluated.key}|${this.#lightsVersion}|${this.shadowMapSize}`;
-      return {view, key, maps, isOld: view.sorted !== key || (this.#lights.length > 0 && this.#maps.key !== maps)};
+      const view = this.#views.get(name), key = `${this.#evaluated.key}|${depthRow(view.camera)}`, maps = this.#mapKeys();
+      return {view, key, maps, isOld: view.sorted !== key || Object.keys(maps).some((kind) => this.#isStale(kind, maps))};
     };
     if (this.#sorting) return exact ? this.#sorting.then(() => this.#sort(name, true)) : this.#sorting;
     const {view, key, maps, isOld} = wanted();
@@ -389,35 +398,57 @@ export class Relight extends EventTarget {
     return this.#sorting;
   }
 
+  /** Return what shadow maps have to be of, by kind; null for none. */
+  #mapKeys() {
+    const {key} = this.#evaluated, {lights, environment} = this.#versions;
+    return {lamps: this.#lights.length ? `${key}|${lights}|${this.shadowMapSize}` : null,
+      regions: this.environmentShadows && this.channel === "relit" ? `${key}|${environment}|${this.rotation}|${this.environmentShadows}` : null};
+  }
+
+  #isStale(kind, keys) {
+    return keys[kind] !== null && this.#maps[kind].key !== keys[kind];
+  }
+
+  /** Return the views of shadow maps, those of a lamp or a region together, and what else is known of them. */
+  async #mapViews(kind) {
+    if (kind === "lamps") {
+      const views = this.#lights.map((light) => shadowViews(light, this.#casters, this.shadowMapSize));
+      require(views.flat().length <= passes.MAPS, `shadow maps must be at most ${passes.MAPS}`, views.flat().length);
+      return {views, lights: this.#lights};
+    }
+    const environment = this.#environment, angle = this.rotation * Math.PI / 180, regions = await environment.regions(this.environmentShadows);
+    const turned = ([x, y, z, ...rest]) => [x * Math.cos(angle) - y * Math.sin(angle), x * Math.sin(angle) + y * Math.cos(angle), z, ...rest];
+    return {views: regions.map(({direction, halfAngle}) => [distantView(turned(direction), halfAngle, this.#casters, REGION_SIDE)]), environment,
+      moments: regions.flatMap(({moments}) => moments.flatMap(turned))};
+  }
+
   /** Return the sphere around what is most of the take. */
   async #bulk(at) {
     const {bulk: {center: [x, y, z], radius}} = await this.#sorter.ask({at, bulk: true});
     return {center: [x, -z, y], radius};
   }
 
-  async #ask(view, key, mapsKey) {
-    const {at} = this.#evaluated, take = this.#take, gpu = this.gpu;
-    let mapViews = null;
-    if (this.#lights.length && this.#maps.key !== mapsKey) {
-      this.#casters = this.casters ?? await this.#bulk(at);
-      mapViews = this.#lights.map((light) => shadowViews(light, this.#casters, this.shadowMapSize));
-      require(mapViews.flat().length <= passes.MAPS, `shadow maps must be at most ${passes.MAPS}`, mapViews.flat().length);
-    }
-    const {orders: [order, ...others]} = await this.#sorter.ask({at, views: [view.camera, ...(mapViews?.flat() ?? [])].map(depthRow)});
+  async #ask(view, key, keys) {
+    const {at} = this.#evaluated, take = this.#take, gpu = this.gpu, kinds = Object.keys(keys).filter((kind) => this.#isStale(kind, keys)), fresh = [];
+    if (kinds.length) this.#casters = this.casters ?? await this.#bulk(at);
+    for (const kind of kinds) fresh.push(await this.#mapViews(kind));
+    const began = performance.now(), mapViews = fresh.flatMap(({views}) => views.flat());
+    const {orders: [order, ...others]} = await this.#sorter.ask({at, views: [view.camera, ...mapViews].map(depthRow)});
+    this.#sortTime = performance.now() - began;
     if (take !== this.#take || gpu !== this.gpu || this.#isLost || this.#isDisposed) return;
     view.order ??= this.gpu.texture({width: ROW, height: this.rows, format: "r32float"});
     this.gpu.write(view.order, order);
     view.sorted = key;
-    if (mapViews) {
-      const old = this.#maps.orders ?? [];
-      const orders = others.map((numbersOf, k) => {
+    kinds.forEach((kind, n) => {
+      const old = this.#maps[kind].orders;
+      const orders = others.splice(0, fresh[n].views.flat().length).map((numbersOf, k) => {
         const texture = old[k] ?? this.gpu.texture({width: ROW, height: this.rows, format: "r32float"});
         this.gpu.write(texture, numbersOf);
         return texture;
       });
       for (const texture of old.slice(orders.length)) this.gpu.destroy(texture);
-      this.#maps = {key: mapsKey, views: mapViews, orders, drawn: false, lights: this.#lights};
-    }
+      this.#maps[kind] = {...fresh[n], key: keys[kind], orders, drawn: false};
+    });
     this.#tell("sorted", {key});
   }
 
@@ -465,28 +496,54 @@ export class Relight extends EventTarget {
     return target;
   }
 
-  #drawMaps() {
-    const views = this.#maps.views.flat(), size = this.shadowMapSize;
-    if (this.#maps.drawn || !views.length) return;
-    const shadows = this.#texture("shadows", size, size, "rgba32float", views.length);
+  /** Draw the maps of a kind into layers of a texture, unless they are there; true if they were drawn. */
+  #drawMaps(kind, name, size) {
+    const maps = this.#maps[kind], views = maps.views.flat();
+    if (maps.drawn || !views.length) return false;
+    const shadows = this.#texture(name, size, size, "rgba32float", views.length);
     views.forEach((view, k) => {
-      const order = this.#maps.orders[k], sums = this.#texture("shadowSums", size, size, this.gpu.blendFormat);
-      this.gpu.draw(this.#programs.depths, {...this.#splats(view, order, SHADOW_FILTERS), targets: [sums], clear: [0, 0, 0, 0]});
-      const medians = this.#median(view, order, SHADOW_FILTERS, "shadowMedians");
-      const meshes = this.meshDepth?.(view, k) ?? this.#textures.nothing;
+      const sums = this.#texture("shadowSums", size, size, this.gpu.blendFormat);
+      this.gpu.draw(this.#programs.depths, {...this.#splats(view, maps.orders[k], SHADOW_FILTERS), targets: [sums], clear: [0, 0, 0, 0]});
+      const medians = this.#median(view, maps.orders[k], SHADOW_FILTERS, "shadowMedians");
+      const meshes = (kind === "lamps" && this.meshDepth?.(view, k)) || this.#textures.nothing;
       this.gpu.draw(this.#programs.texels, {targets: [[shadows, k]], textures: {sums, medians, behindOf: meshes}, uniforms: {meshes: [meshes.width, 0, 0, 0]}});
     });
-    this.#maps.drawn = true;
+    return maps.drawn = true;
+  }
+
+  /** Find what arrives of the environment at each Gaussian, if shadows of its regions are known: the texture, or null. */
+  #arriving() {
+    const {views, environment, moments} = this.#maps.regions, t = this.#textures;
+    if (!this.environmentShadows || this.channel !== "relit" || environment !== this.#environment) return null;
+    this.#regionPrograms();
+    const target = this.#texture("arriving", ROW, this.rows, "rgba32float");
+    if (this.#drawMaps("regions", "regionShadows", REGION_SIDE)) {
+      this.gpu.draw(this.#programs.arrive, {targets: [target], uniforms: {turn: this.#turn, counts: [views.length, 0, 0, 0], levels: this.levels,
+        regions: moments, maps: views.flat().flatMap((each) => mapNumbers(each, this.#thickness))},
+      textures: {positions: t.positions, colors: t.colors, normals: t.normals, environment: t.environment, albedo: t.albedo, shadows: t.regionShadows}});
+    }
+    return target;
+  }
+
+  /** How thick a layer of Gaussians is for shadows [m]. */
+  get #thickness() {
+    return this.#casters ? Math.min(this.thickness, THICKEST * this.#casters.radius) : 0;
+  }
+
+  /** The environment's angle about z as shaders take it, and its gain. */
+  get #turn() {
+    const angle = this.rotation * Math.PI / 180;
+    return [Math.cos(angle), Math.sin(angle), this.environmentGain, 0];
   }
 
   /** Cameras of the lamps' shadow maps, as they were drawn last; `meshDepth(view, k)` may return depths of meshes for them. */
   get shadowViews() {
-    return this.#maps.views.flat();
+    return this.#maps.lamps.views.flat();
   }
 
   /** Draw shadow maps again: meshes have moved. */
   redrawShadows() {
-    this.#maps.drawn = false;
+    if (this.#maps.lamps.views.length) this.#maps.lamps.drawn = false;
   }
 
   /** Return a texture by its name, to be read by others who draw with the same GPU: "lit", "sums2", "positions" …. */
@@ -497,6 +554,8 @@ export class Relight extends EventTarget {
   /** Draw what is at hand now, lit, into textures: true if there is anything. */
   shade(camera) {
     if (this.#isLost || this.#isDisposed || !this.#take) return false;
+    const regions = this.environmentShadows;
+    require(regions === 0 || (Number.isInteger(Math.log2(regions)) && regions <= passes.REGIONS), `environmentShadows must be 0, or a power of two up to ${passes.REGIONS}`, regions);
     const view = viewOf(camera), name = camera.name ?? "main", {width, height} = view;
     this.#advance();
     if (!this.#views.has(name)) this.#views.set(name, {});
@@ -506,29 +565,29 @@ export class Relight extends EventTarget {
     if (!order || !this.#evaluated) return false;
     const t = this.#textures, format = this.gpu.blendFormat, {raster_low_pass: low, raster_antialiased: thin} = this.#take.manifest.metadata ?? {};
     const filters = [Number(low) > 0 ? Number(low) : 0.3, 0.01, thin === "true" ? 1 : 0, 0];
-    const sums = [0, 1, 2].map((k) => this.#texture(`sums${k}`, width, height, format));
+    const arriving = this.#arriving(), sums = Array.from({length: arriving ? 4 : 3}, (_, k) => this.#texture(`sums${k}`, width, height, format));
     const splats = this.#splats(view, order, filters);
     if (this.channel === "radiance") splats.textures.colors = this.#captured(view);
-    this.gpu.draw(this.#programs.gbuffer, {...splats, targets: sums, clear: [0, 0, 0, 0]});
-    const lights = this.#lights.length ? this.#maps.lights ?? [] : [], hasLamps = lights.length > 0; // those that maps are of
+    splats.textures.arriving = arriving;
+    this.gpu.draw(arriving ? this.#programs.gbufferArriving : this.#programs.gbuffer, {...splats, targets: sums, clear: [0, 0, 0, 0]});
+    const maps = this.#maps.lamps, lights = this.#lights.length ? maps.lights ?? [] : [], hasLamps = lights.length > 0; // those that maps are of
     if (hasLamps) {
       this.#lampPrograms();
-      this.#drawMaps();
+      this.#drawMaps("lamps", "shadows", this.shadowMapSize);
     }
     const medians = hasLamps ? this.#median(view, order, filters, "medians") : t.nothing;
     let first = 0;
     const lamps = lights.flatMap((light, k) => {
-      const maps = this.#maps.views[k].length;
-      first += maps;
-      return lampNumbers(light, first - maps, maps);
+      const count = maps.views[k].length;
+      first += count;
+      return lampNumbers(light, first - count, count);
     });
-    const thickness = this.#casters ? Math.min(this.thickness, THICKEST * this.#casters.radius) : 0, angle = this.rotation * Math.PI / 180;
     const lit = this.#texture("lit", width, height, "rgba32float");
-    this.gpu.draw(this.#programs.deferred, {targets: [lit], textures: {sums0: sums[0], sums1: sums[1], sums2: sums[2], medians,
+    this.gpu.draw(this.#programs.deferred, {targets: [lit], textures: {sums0: sums[0], sums1: sums[1], sums2: sums[2], sums3: sums[3] ?? t.nothing, medians,
       environment: t.environment, albedo: t.albedo, shadows: this.#textures.shadows ?? t.noMap},
-    uniforms: {...cameraNumbers(view, 0), turn: [Math.cos(angle), Math.sin(angle), this.environmentGain, 0], levels: this.levels, lamps,
-      counts: [lights.length, this.background === "environment" && this.channel === "relit" ? 1 : 0, 0, 0],
-      maps: hasLamps ? this.#maps.views.flat().flatMap((each) => mapNumbers(each, thickness)) : []}});
+    uniforms: {...cameraNumbers(view, 0), turn: this.#turn, levels: this.levels, lamps,
+      counts: [lights.length, this.background === "environment" && this.channel === "relit" ? 1 : 0, arriving ? 1 : 0, 0],
+      maps: hasLamps ? maps.views.flat().flatMap((each) => mapNumbers(each, this.#thickness)) : []}});
     return true;
   }
 
@@ -555,11 +614,16 @@ export class Relight extends EventTarget {
     return [Math.max(middle - radius, 0.01), middle + radius];
   }
 
-  /** Resolves when the moment's segment is here, and all that was drawn last is in order. */
+  /** Resolves when the moment's segment is here, or cannot be read, and all that was drawn last is in order. */
   async ready() {
     require(this.#take, "a take must be open", null);
-    await this.#load(this.#place().number);
-    if (this.#isLost || !this.#segments.has(this.#place().number)) return;
+    for (const segments = this.#segments; segments && segments === this.#segments && !this.#isLost && !this.#isDisposed;) {
+      const {number} = this.#place();
+      segments.want(number);
+      if (segments.has(number) || segments.hasFailed(number)) break;
+      await segments.load(number);
+    }
+    if (this.#isLost || this.#isDisposed || !this.#segments) return;
     this.#advance();
     for (const name of this.#views.keys()) await this.#sort(name, true);
   }
@@ -581,6 +645,7 @@ export class Relight extends EventTarget {
   }
 }
 
+const texels = (texture) => texture ? texture.width * texture.height * texture.layers : 0;
 const mapped = (object, change) => Object.fromEntries(Object.entries(object).map(([k, v]) => [k, change(v)]));
 
 /** Return the median over Gaussians of the middle one of three standard deviations [m]. */

@@ -10,8 +10,8 @@
 export const ROW = 1024;
 /** Most planes that a frame may be a sum of. */
 export const TERMS = 512;
-/** Most lamps, and most shadow maps of all lamps. */
-export const LAMPS = 16, MAPS = 24;
+/** Most lamps, most shadow maps of all lamps, and most regions of an environment that cast shadows. */
+export const LAMPS = 16, MAPS = 24, REGIONS = 32;
 /** To find the median, splats are divided into this many bins, the right bin into as many again, and so often. */
 export const BINS = 16, SEARCHES = 3;
 
@@ -144,13 +144,14 @@ ${HARMONICS.map((basis, k) => `  if (int(u.eye.w) > ${k}) {\n    color += (${bas
 const LOG_CUT = "5.541263545158426";
 
 /** A Gaussian becomes a parallelogram around the ellipse where its alpha is 1/255; instances come back to front. */
-const SPLAT = (materialsToo) => `${CELL}
+const SPLAT = (materialsToo, arrivingToo = false) => `${CELL}
 void vertexMain() {
   position = vec4(2.0, 2.0, 0.0, 1.0);
   v0 = vec4(0.0);
   v1 = vec4(0.0);
   v2 = vec4(0.0);
   ${materialsToo ? "v3 = vec4(0.0);\n  v4 = vec4(0.0);" : ""}
+  ${arrivingToo ? "v5 = vec4(0.0);" : ""}
   int rank = int(u.image.w) - 1 - instanceIndex;
   int index = int(fetch(order, cellOf(rank), 0).x);
   ivec2 cell = cellOf(index);
@@ -206,6 +207,7 @@ void vertexMain() {
   v1 = vec4(inversesqrt(xx), xy / xx, sqrt(xx / det), 3.0 * max(s.x, max(s.y, s.z)));
   v2 = vec4(dot(a, b0) / aa, dot(a, b1) / aa, float(rank), sizes.w);
   ${materialsToo ? "v3 = fetch(colors, cell, 0);\n  v4 = fetch(normals, cell, 0);" : ""}
+  ${arrivingToo ? "v5 = fetch(arriving, cell, 0);" : ""}
   float reach = sqrt(2.0 * (${LOG_CUT} + logOpacity)) * 1.0001 + 1.0e-3;
   vec2 e = reach * vec2(float(vertexIndex % 2) * 2.0 - 1.0, float(vertexIndex / 2) * 2.0 - 1.0);
   float dx = e.x / v1.x;
@@ -240,10 +242,13 @@ float depthHere() {
 const VIEW = ["right", "down", "forward", "eye", "lens", "image", "filters"].map((name) => [name]);
 const CLOUD = ["order", "positions", "orientations", "scales"].map((name) => [name, "float2d"]);
 
-/** Sums of materials and depth: colour; normal; roughness, occlusion, depth; alpha in each. */
-export const gbuffer = (format) => ({
-  name: "gbuffer", uniforms: VIEW, textures: [...CLOUD, ["colors", "float2d"], ["normals", "float2d"]], varyings: 5,
-  outputs: Array(3).fill(format), blend: "over", vertex: SPLAT(true),
+/**
+ * Sums of materials and depth: colour; normal; roughness, occlusion, depth; alpha in each. With what arrives of the
+ * environment: that too, and its share instead of occlusion.
+ */
+export const gbuffer = (format, arriving = false) => ({
+  name: "gbuffer", uniforms: VIEW, textures: [...CLOUD, ...["colors", "normals", ...(arriving ? ["arriving"] : [])].map((name) => [name, "float2d"])],
+  varyings: arriving ? 6 : 5, outputs: Array(arriving ? 4 : 3).fill(format), blend: "over", vertex: SPLAT(true, arriving),
   fragment: `${SEEN}
 void fragmentMain() {
   float alpha = alphaHere();
@@ -252,7 +257,8 @@ void fragmentMain() {
   }
   out0 = vec4(v3.xyz * alpha, alpha);
   out1 = vec4(v4.xyz * alpha, alpha);
-  out2 = vec4(vec3(v2.w, v3.w, depthHere()) * alpha, alpha);
+  out2 = vec4(vec3(v2.w, ${arriving ? "v5" : "v3"}.w, depthHere()) * alpha, alpha);
+  ${arriving ? "out3 = vec4(v5.xyz * alpha, alpha);" : ""}
 }
 `,
 });
@@ -407,17 +413,57 @@ vec2 albedoTexel(ivec2 cell) {
 }
 `;
 
+const NO_REGIONS = `
+int regionCount() {
+  return 0;
+}
+Region regionAt(int k) {
+  Region region;
+  region.map = k;
+  return region;
+}
+`;
+
+/** What arrives of the environment at each Gaussian, shadows of its regions taken into account, and its share. */
+export const arrive = (shading) => ({
+  name: "arrive",
+  uniforms: [["turn"], ["counts"], ["levels", 14], ["regions", 3 * REGIONS], ["maps", 5 * REGIONS]],
+  textures: [["positions", "float2d"], ["colors", "float2d"], ["normals", "float2d"], ["environment", "float2d"], ["albedo", "float2d"],
+    ["shadows", "array"]],
+  outputs: ["rgba32float"], shading,
+  fragment: `#shading
+${HOOKS}
+int regionCount() {
+  return int(u.counts.x);
+}
+Region regionAt(int k) {
+  Region region;
+  region.red = u.regions[3 * k];
+  region.green = u.regions[3 * k + 1];
+  region.blue = u.regions[3 * k + 2];
+  region.map = k;
+  return region;
+}
+void fragmentMain() {
+  ivec2 cell = ivec2(pixel);
+  vec4 place = fetch(positions, cell, 0);
+  vec4 look = fetch(colors, cell, 0);
+  vec4 normal = fetch(normals, cell, 0);
+  out0 = arrivingLight(place.xyz, normal.xyz, look.w, randomTurn(uint(cell.y * ${ROW} + cell.x)), u.turn.xy);
+}
+`,
+});
+
 const CAMERA = [["right"], ["down"], ["forward"], ["eye"], ["lens"], ["image"]];
 
 /** Radiance multiplied by alpha, and alpha; the texture has the rows of the image, top first. */
 export const deferred = (shading) => ({
   name: "deferred",
   uniforms: [...CAMERA, ["turn"], ["counts"], ["levels", 14], ["lamps", 4 * LAMPS], ["maps", 5 * MAPS]],
-  textures: [["sums0", "float2d"], ["sums1", "float2d"], ["sums2", "float2d"], ["medians", "float2d"], ["environment", "float2d"],
-    ["albedo", "float2d"], ["shadows", "array"]],
+  textures: [...["sums0", "sums1", "sums2", "sums3", "medians", "environment", "albedo"].map((name) => [name, "float2d"]), ["shadows", "array"]],
   outputs: ["rgba32float"], shading,
   fragment: `#shading
-${HOOKS}
+${HOOKS}${NO_REGIONS}
 Lamp lampAt(int k) {
   Lamp lamp;
   vec4 a = u.lamps[4 * k];
@@ -449,7 +495,12 @@ void fragmentMain() {
       depth = min(depth, middle.x / max(middle.y, 1.0e-12));
     }
     Surface surface = surfaceOfSums(color.xyz, rest.x, rest.y, normal, alpha, u.eye.xyz, ray, depth);
-    vec3 radiance = environmentRadiance(surface, u.turn.xy) * u.turn.z;
+    vec3 radiance = vec3(0.0);
+    if (u.counts.z > 0.5) {
+      radiance = shadowedRadiance(surface, fetch(sums3, cell, 0).xyz / alpha, u.turn.xy) * u.turn.z;
+    } else {
+      radiance = environmentRadiance(surface, u.turn.xy) * u.turn.z;
+    }
     vec2 turn = randomTurn(uint(cell.y) * uint(u.image.x) + uint(cell.x));
     for (int k = 0; k < int(u.counts.x); k++) {
       radiance += lampRadiance(surface, lampAt(k), turn);

@@ -101,7 +101,8 @@ export function sortingWorker() {
     if (message.drop !== undefined) segments.delete(message.drop);
     if (!message.at) return null;
     evaluate(message.at);
-    return {orders: (message.views ?? []).map(order), bulk: message.bulk ? bulk() : null};
+    const orders = (message.views ?? []).map(order);
+    return {orders, bulk: message.bulk ? bulk() : null, transfer: orders.map(({buffer}) => buffer)};
   };
 }
 

@@ -6,7 +6,8 @@
  *     scene.add(person);
  *     person.time = seconds; // in every frame
  *
- * The object's axes are three's: y up, metres. It draws with the renderer's own WebGL2 context, in `onBeforeRender`.
+ * The object's axes are three's: y up, metres. It draws in `onBeforeRender`, with the WebGL2 context of a `WebGLRenderer` or
+ * the device of a `WebGPURenderer`. A host is what differs between them: `WebGLHost` here, `WebGPUHost` in three-webgpu.js.
  */
 
 import * as THREE from "three";
@@ -37,7 +38,6 @@ const SHADOW = `
 uniform highp sampler2D positions;
 uniform highp sampler2D orientations;
 uniform highp sampler2D scales;
-out vec2 corner;
 vec3 turned(vec4 q, vec3 v) {
   return v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v);
 }
@@ -49,9 +49,8 @@ void main() {
   vec3 a = vec3(s.x, 0.0, 0.0), b = vec3(0.0, s.y, 0.0), c = vec3(0.0, 0.0, s.z);
   if (s.x <= s.y && s.x <= s.z) a = c;
   else if (s.y <= s.z) b = c;
-  corner = position.xy;
   float reach = sqrt(max(2.0 * log(3.0 * place.w), 0.0));
-  vec3 world = place.xyz + turned(q, reach * (corner.x * a + corner.y * b));
+  vec3 world = place.xyz + turned(q, reach * (position.x * a + position.y * b));
   gl_Position = projectionMatrix * modelViewMatrix * vec4(world.x, world.z, -world.y, 1.0);
 }`;
 
@@ -89,30 +88,79 @@ async function environmentOf({image: {data, width, height}, type, flipY}) {
   return Environment.of({height, radiance});
 }
 
+/** What `RelightObject` needs of a `WebGLRenderer`. */
+class WebGLHost {
+  constructor(renderer) {
+    Object.assign(this, {renderer, canvas: renderer.domElement, options: {backend: "webgl2", context: renderer.getContext()}, isTopFirst: false});
+  }
+
+  /** Return the material that shows Gaussians on a triangle over the whole view. */
+  display() {
+    const textures = Object.fromEntries(["lit", "depths"].map((name) => [name, {value: new THREE.ExternalTexture()}]));
+    this.shown = {...textures, projection: {value: new THREE.Matrix4()}, unit: {value: 1}, rows: {value: 1}};
+    return new THREE.ShaderMaterial({uniforms: this.shown, vertexShader: "void main() { gl_Position = vec4(position, 1.0); }", fragmentShader: DISPLAY,
+      transparent: true, premultipliedAlpha: true, depthWrite: true});
+  }
+
+  /** Show what was drawn last, through a camera, in an object of a size; without a camera, nothing. */
+  show(relight, camera, size) {
+    const {lit, depths, projection, unit, rows} = this.shown;
+    lit.value.sourceTexture = camera ? relight.texture("lit").handle : null; // null is clear
+    if (!camera) return;
+    depths.value.sourceTexture = relight.texture("sums2").handle;
+    projection.value.copy(camera.projectionMatrix);
+    unit.value = size;
+    rows.value = relight.texture("lit").height;
+  }
+
+  /** Return the material of a disc for each Gaussian, and the one by which three's shadow maps see it. */
+  caster(relight) {
+    const uniforms = Object.fromEntries(["positions", "orientations", "scales"].map((name) => [name, {value: new THREE.ExternalTexture()}]));
+    const shadow = new THREE.ShaderMaterial({uniforms, side: THREE.DoubleSide, glslVersion: THREE.GLSL3, vertexShader: SHADOW,
+      fragmentShader: "out vec4 shown;\nvoid main() { shown = vec4(1.0); }"});
+    this.cast = () => { for (const [name, {value}] of Object.entries(uniforms)) value.sourceTexture = relight.texture(name).handle; };
+    return {material: new THREE.MeshBasicMaterial({colorWrite: false, depthWrite: false, shadowSide: THREE.DoubleSide}), shadow};
+  }
+
+  /** Return the material that writes how far meshes are from a camera. */
+  depthOnly() {
+    return new THREE.ShaderMaterial({side: THREE.DoubleSide, blending: THREE.NoBlending,
+      vertexShader: "varying float depth;\nvoid main() { vec4 p = modelViewMatrix * vec4(position, 1.0); depth = -p.z; gl_Position = projectionMatrix * p; }",
+      fragmentShader: "varying float depth;\nvoid main() { gl_FragColor = vec4(depth, 0.0, 0.0, 1.0); }"});
+  }
+
+  /** Return a target's texture as the renderer of Gaussians reads it. */
+  read({texture, width, height}) {
+    return {handle: this.renderer.properties.get(texture).__webglTexture, target: this.options.context.TEXTURE_2D, width, height};
+  }
+
+  /** Tell the renderer that others have changed the state of its context. */
+  settle() {
+    this.renderer.resetState();
+  }
+}
+
 /** Gaussians of a take in a scene. Events: change (draw again), and those of `Relight` through `relight`. */
 export class RelightObject extends THREE.Mesh {
-  /** Return an object that a `WebGLRenderer` draws; `shadowMapSize` is the side of the lamps' maps [texel]. */
+  /** Return an object that a `WebGLRenderer` or a `WebGPURenderer` draws; `shadowMapSize` is the side of the lamps' maps [texel]. */
   static async create(renderer, take, {shadowMapSize = 1024} = {}) {
-    const context = renderer.getContext();
-    const relight = await Relight.create(renderer.domElement, {backend: "webgl2", context, shadowMapSize});
-    const geometry = new THREE.BufferGeometry();
+    const host = renderer.isWebGPURenderer ? await (await import("./three-webgpu.js")).WebGPUHost.of(renderer) : new WebGLHost(renderer);
+    const relight = await Relight.create(host.canvas, {...host.options, shadowMapSize});
+    const geometry = Object.assign(new THREE.InstancedBufferGeometry(), {instanceCount: 1});
     geometry.setAttribute("position", new THREE.Float32BufferAttribute([-1, -1, 0, 3, -1, 0, -1, 3, 0], 3));
-    const textures = Object.fromEntries(["lit", "depths"].map((name) => [name, {value: new THREE.ExternalTexture()}]));
-    const material = new THREE.ShaderMaterial({
-      uniforms: {...textures, projection: {value: new THREE.Matrix4()}, unit: {value: 1}, rows: {value: 1}},
-      vertexShader: "void main() { gl_Position = vec4(position, 1.0); }", fragmentShader: DISPLAY,
-      transparent: true, premultipliedAlpha: true, depthWrite: true,
-    });
-    const object = Object.assign(new RelightObject(geometry, material), {relight, frustumCulled: false, castShadow: true, receiveShadow: true});
+    const object = Object.assign(new RelightObject(geometry, host.display(relight)), {relight, frustumCulled: false, castShadow: true, receiveShadow: true});
+    object.#host = host;
+    object.onBeforeShadow = () => { geometry.instanceCount = 0; }; // its child casts the shadow
+    object.onAfterShadow = () => { geometry.instanceCount = 1; };
     await relight.open(take);
-    renderer.resetState();
+    host.settle();
     object.#addCaster(take.manifest.count);
     relight.meshDepth = (_, k) => object.#meshDepths[k];
     for (const type of ["sorted", "restored", "resumed"]) relight.addEventListener(type, () => object.dispatchEvent({type: "change"}));
     return object;
   }
 
-  #caster; #meshDepths = []; #targets = []; #depthMaterial; #casters = ""; #lamps = ""; #environment = null; #isBusy = false;
+  #host; #caster; #meshDepths = []; #targets = []; #depthMaterial; #casters = ""; #lamps = ""; #environment = null; #isBusy = false;
 
   /** Moment that is shown [s]. */
   get time() {
@@ -123,21 +171,15 @@ export class RelightObject extends THREE.Mesh {
     this.relight.time = seconds;
   }
 
-  /** A child that only shadow maps see. */
+  /** A child that only shadow maps see: an octagon a Gaussian. */
   #addCaster(count) {
-    const geometry = new THREE.InstancedBufferGeometry();
-    geometry.setAttribute("position", new THREE.Float32BufferAttribute([-1, -1, 0, 1, -1, 0, -1, 1, 0, 1, 1, 0], 3));
-    geometry.setIndex([0, 1, 2, 2, 1, 3]);
-    geometry.instanceCount = 0;
-    const uniforms = Object.fromEntries(["positions", "orientations", "scales"].map((name) => [name, {value: new THREE.ExternalTexture()}]));
-    const material = new THREE.ShaderMaterial({uniforms, side: THREE.DoubleSide, glslVersion: THREE.GLSL3, vertexShader: SHADOW,
-      fragmentShader: "in vec2 corner;\nout vec4 shown;\nvoid main() { if (dot(corner, corner) > 1.0) discard; shown = vec4(1.0); }"});
-    const caster = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({colorWrite: false, depthWrite: false, shadowSide: THREE.DoubleSide}));
-    Object.assign(caster, {castShadow: true, frustumCulled: false, customDepthMaterial: material, customDistanceMaterial: material});
+    const geometry = Object.assign(new THREE.InstancedBufferGeometry().copy(new THREE.CircleGeometry(1, 8)), {instanceCount: 0});
+    const {material, shadow} = this.#host.caster(this.relight), caster = new THREE.Mesh(geometry, material);
+    Object.assign(caster, {castShadow: true, frustumCulled: false, customDepthMaterial: shadow, customDistanceMaterial: shadow});
     caster.onBeforeShadow = () => {
       const isDrawn = this.castShadow && this.relight.texture("lit");
       geometry.instanceCount = isDrawn ? count : 0;
-      if (isDrawn) for (const [name, {value}] of Object.entries(uniforms)) value.sourceTexture = this.relight.texture(name).handle;
+      if (isDrawn) this.#host.cast();
     };
     caster.onAfterShadow = () => { geometry.instanceCount = 0; };
     this.#caster = caster;
@@ -155,17 +197,9 @@ export class RelightObject extends THREE.Mesh {
       this.#drawMeshDepths(renderer, scene);
       const {width, height} = target ?? renderer.getDrawingBufferSize(new THREE.Vector2());
       const view = this.#view(camera, toObject, width, height);
-      const isThere = this.relight.shade(view), {uniforms} = this.material;
-      uniforms.lit.value.sourceTexture = null; // which is clear
-      if (isThere) {
-        uniforms.lit.value.sourceTexture = this.relight.texture("lit").handle;
-        uniforms.depths.value.sourceTexture = this.relight.texture("sums2").handle;
-        uniforms.projection.value.copy(camera.projectionMatrix);
-        uniforms.unit.value = size;
-        uniforms.rows.value = view.height;
-      }
+      this.#host.show(this.relight, this.relight.shade(view) ? camera : null, size);
     } finally {
-      renderer.resetState();
+      this.#host.settle();
       renderer.setRenderTarget(target, face, level);
       this.#isBusy = false;
     }
@@ -206,41 +240,40 @@ export class RelightObject extends THREE.Mesh {
     if (key === this.#casters) return;
     this.#casters = key;
     this.relight.redrawShadows();
-    this.#depthMaterial ??= new THREE.ShaderMaterial({side: THREE.DoubleSide, blending: THREE.NoBlending,
-      vertexShader: "varying float depth;\nvoid main() { vec4 p = modelViewMatrix * vec4(position, 1.0); depth = -p.z; gl_Position = projectionMatrix * p; }",
-      fragmentShader: "varying float depth;\nvoid main() { gl_FragColor = vec4(depth, 0.0, 0.0, 1.0); }"});
+    this.#depthMaterial ??= this.#host.depthOnly();
     while (this.#targets.length > views.length) this.#targets.pop().dispose();
-    const {autoUpdate} = renderer.shadowMap, {overrideMaterial, background} = scene, color = renderer.getClearColor(new THREE.Color()), alpha = renderer.getClearAlpha();
+    const {autoClear} = renderer, {autoUpdate} = renderer.shadowMap, {overrideMaterial, background} = scene, color = renderer.getClearColor(new THREE.Color()), alpha = renderer.getClearAlpha();
     Object.assign(scene, {overrideMaterial: this.#depthMaterial, background: null});
     renderer.shadowMap.autoUpdate = false;
+    renderer.autoClear = true;
     renderer.setClearColor(0, 0);
     this.visible = false;
     for (const mesh of casters) mesh.layers.enable(31);
     views.forEach((view, k) => {
-      this.#targets[k] ??= new THREE.WebGLRenderTarget(view.width, view.height, {type: THREE.FloatType, minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter});
+      this.#targets[k] ??= new (this.#host.isTopFirst ? THREE.RenderTarget : THREE.WebGLRenderTarget)(view.width, view.height, {type: THREE.FloatType, minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter});
       renderer.setRenderTarget(this.#targets[k]);
-      renderer.clear();
-      renderer.render(scene, this.#lampCamera(view));
-      const handle = renderer.properties.get(this.#targets[k].texture).__webglTexture;
-      this.#meshDepths[k] = {handle, target: renderer.getContext().TEXTURE_2D, width: view.width, height: view.height};
+      renderer.render(scene, this.#lampCamera(view, renderer));
+      this.#meshDepths[k] = this.#host.read(this.#targets[k]);
     });
     for (const mesh of casters) mesh.layers.disable(31);
     this.visible = true;
     renderer.setClearColor(color, alpha);
     renderer.shadowMap.autoUpdate = autoUpdate;
+    renderer.autoClear = autoClear;
     Object.assign(scene, {overrideMaterial, background});
   }
 
   /** Return a camera that sees what a shadow map sees, its top row first. */
-  #lampCamera({position, right, down, forward, focal, width}) {
+  #lampCamera({position, right, down, forward, focal, width}, {coordinateSystem = THREE.WebGLCoordinateSystem}) {
     const camera = new THREE.Camera(), far = 2 * Math.hypot(...position) + 1000, near = Math.max(far * 1e-6, 0.01);
     const pose = new THREE.Matrix4().makeBasis(fromZUp(right), fromZUp(down).negate(), fromZUp(forward).negate()).setPosition(fromZUp(position));
+    Object.assign(camera, {coordinateSystem});
     camera.layers.set(31);
     camera.matrixAutoUpdate = camera.matrixWorldAutoUpdate = false;
     camera.matrixWorld.multiplyMatrices(this.matrixWorld, pose);
     camera.matrixWorldInverse.copy(camera.matrixWorld).invert();
-    const f = 2 * focal[0] / width;
-    camera.projectionMatrix.set(f, 0, 0, 0, 0, -f, 0, 0, 0, 0, -(far + near) / (far - near), -2 * far * near / (far - near), 0, 0, -1, 0);
+    const f = 2 * focal[0] / width, depth = this.#host.isTopFirst ? [far, far * near] : [far + near, 2 * far * near]; // 0 to 1, or -1 to 1
+    camera.projectionMatrix.set(f, 0, 0, 0, 0, this.#host.isTopFirst ? f : -f, 0, 0, 0, 0, -depth[0] / (far - near), -depth[1] / (far - near), 0, 0, -1, 0);
     camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
     return camera;
   }
@@ -254,6 +287,7 @@ export class RelightObject extends THREE.Mesh {
   dispose() {
     this.relight.dispose();
     for (const target of this.#targets) target.dispose();
-    for (const each of [this.geometry, this.material, this.#caster.geometry, this.#caster.material, this.#caster.customDepthMaterial]) each.dispose();
+    const {geometry, material, customDepthMaterial} = this.#caster;
+    for (const each of [this.geometry, this.material, this.#depthMaterial, geometry, material, customDepthMaterial]) each?.dispose();
   }
 }

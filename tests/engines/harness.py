@@ -210,28 +210,38 @@ def program(target: str, function: str, folder: Path) -> Iterator[Program]:
 def packed(golden: Golden) -> FloatArray:
     """Return all that ``harness.slang`` reads of a case."""
     camera, maps, buffer = golden.shot.camera, shadow_maps(golden), golden.buffer
-    pixels = np.zeros((len(buffer.alpha), 3, 4), np.float32)
-    pixels[:, :2] = buffer.sums.reshape(-1, 2, 4)
+    pixels = np.zeros((len(buffer.alpha), 4, 4), np.float32)
+    pixels[:, :2] = buffer.sums[:, :8].reshape(-1, 2, 4)
     pixels[:, 2, 0], pixels[:, 2, 1] = buffer.alpha, buffer.depth
+    if golden.regions:
+        pixels[:, 3] = buffer.sums[:, 8:]
+    cloud = golden.shot.cloud
+    gaussians = np.zeros((len(cloud), 2, 4), np.float32)
+    gaussians[:, 0, :3], gaussians[:, 0, 3] = cloud.positions, cloud.ambient_occlusion
+    gaussians[:, 1, :3] = cloud.normals
+    moments = golden.regions.moments.transpose(1, 0, 2).reshape(-1, 4) if golden.regions else np.zeros((0, 4))
     levels = prefiltered(golden.shot.environment)
     parts = {
         "pixels": pixels.reshape(-1, 4),
         "lamps": _lamp_rows(golden, maps.counts),
+        "gaussians": gaussians.reshape(-1, 4),
+        "regions": moments.astype(np.float32),
         "views": _view_rows(maps),
         "shadows": maps.texels.reshape(-1, 4),
         "levels": np.zeros((len(levels), 4), np.float32),
         "albedo": _padded(specular_albedo_table().reshape(-1, 2)),
         "texels": np.concatenate([_padded(level.reshape(-1, 3)) for level in levels]),
     }
-    starts = dict(zip(parts, np.cumsum([9, *(len(part) for part in parts.values())]), strict=False))
+    starts = dict(zip(parts, np.cumsum([10, *(len(part) for part in parts.values())]), strict=False))
     rows = [len(level) for level in levels]
     parts["levels"][:, 0] = starts["texels"] + np.cumsum([0, *(2 * each * each for each in rows)])[:-1]
     parts["levels"][:, 1] = rows
     angle = np.radians(golden.shot.environment_rotation)
-    head = np.zeros((9, 4), np.float32)
+    head = np.zeros((10, 4), np.float32)
     head[0] = camera.width, camera.height, len(golden.shot.lights), maps.texels.shape[1]
     head[1, :2] = np.cos(angle), np.sin(angle)
-    head[2, :2] = starts["pixels"], starts["lamps"]
+    head[2] = starts["pixels"], starts["lamps"], starts["gaussians"], starts["regions"]
+    head[9, 1:3] = len(golden.regions or ()), sum(maps.counts)
     head[3] = starts["views"], starts["shadows"], starts["levels"], starts["albedo"]
     head[4, :3] = camera.position
     head[5:8, :3] = camera.world_to_camera[:3, :3]

@@ -1,8 +1,8 @@
 """Probes for engines: assets, lights and cameras, and what beam_warp's deferred renderer makes of them on the CPU.
 
 `goldens` returns cases; each has everything that an engine needs to draw the same picture, and the picture. Nothing is
-kept in files: a case takes about a second. Environment shadows and bounces are off (`UNSHADOWED`), as engines have it:
-ambient occlusion and specular occlusion stand for them.
+kept in files: a case takes about a second. Bounces are off, and so are environment shadows unless `REGIONS` are asked
+for: ambient occlusion and specular occlusion stand for them.
 
     for golden in goldens(["tripod"], ["studio", "spot"]):
         golden.shot                           # cloud, camera, environment and its rotation, lights
@@ -15,7 +15,7 @@ ambient occlusion and specular occlusion stand for them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -27,12 +27,13 @@ from web import probe
 from beam_warp.demo.lights import demo_environments
 from beam_warp.image.color import srgb_to_linear
 from beam_warp.light.prefiltered import blurred_environment
+from beam_warp.light.regions import EnvironmentRegions
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import DeferredOptions
 from beam_warp.render.prepared_shot import DeferredFrame
-from beam_warp.render.shadow_maps import ShadowCasters, ShadowDrawer, ShadowView, light_views
+from beam_warp.render.shadow_maps import ShadowCasters, ShadowDrawer, ShadowView, distant_view, light_views
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
@@ -51,6 +52,9 @@ ROTATION = 40.0
 """Rotation of environments about z [degree]."""
 
 OPTIONS = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=MAP_SIZE)
+REGIONS = replace(OPTIONS, environment_shadows=16, environment_map_size=MAP_SIZE)
+"""With shadows of the environment: a map of each of its regions."""
+
 TAPS = (16, 32)
 
 
@@ -159,7 +163,8 @@ class Buffer:
     """What ordered blending leaves of every pixel, row by row.
 
     Attributes:
-        sums: Base colour, roughness, ambient occlusion and normal, weighted by visibility, ``(P, 8)``.
+        sums: Base colour, roughness, ambient occlusion and normal, weighted by visibility, ``(P, 8)``; with regions
+            also what arrives and its share, ``(P, 12)``.
         alpha: Sum of weights, ``(P,)``.
         depth: Depth of the surface [m], ``(P,)``: the lesser of mean and median.
     """
@@ -179,6 +184,7 @@ class Golden:
         shot: Asset, camera and light.
         frame: The shot on the device.
         image: The truth.
+        regions: Regions of the environment that cast shadows, turned as it is, or None.
     """
 
     probe: str
@@ -186,19 +192,24 @@ class Golden:
     shot: Shot
     frame: DeferredFrame
     image: RenderedImage
+    regions: EnvironmentRegions | None = None
 
     @cached_property
     def buffer(self) -> Buffer:
         """What was blended."""
+        count = self.frame.gaussians.values.shape[1]
         rasterizer = Rasterizer(
-            len(self.shot.cloud), [self.shot.camera], value_count=8, options=RasterOptions(), device="cpu"
+            len(self.shot.cloud), [self.shot.camera], value_count=count, options=RasterOptions(), device="cpu"
         )
         images = rasterizer.draw(self.frame.gaussians)
         depth = np.minimum(images.depth.numpy(), images.median_depth.numpy())
-        return Buffer(images.channels[0].numpy()[:, :8].copy(), images.alpha.numpy().copy(), depth)
+        sums = np.concatenate([channels.numpy() for channels in images.channels], axis=1)[:, :count]
+        return Buffer(sums, images.alpha.numpy().copy(), depth)
 
 
-def goldens(probes: Sequence[str] = tuple(PROBES), lightings: Sequence[str] = LIGHTINGS) -> Iterator[Golden]:
+def goldens(
+    probes: Sequence[str] = tuple(PROBES), lightings: Sequence[str] = LIGHTINGS, options: DeferredOptions = OPTIONS
+) -> Iterator[Golden]:
     """Yield the cases of some probes under some lightings."""
     for name in probes:
         cloud = PROBES[name]()
@@ -215,8 +226,10 @@ def goldens(probes: Sequence[str] = tuple(PROBES), lightings: Sequence[str] = LI
                 environment_rotation=ROTATION,
                 lights=(lamp(lighting, middle, size),) if lighting in LAMPS else (),
             )
-            frame = DeferredRenderer(OPTIONS, device="cpu").frame(shot)
-            yield Golden(name, lighting, shot, frame, frame.image())
+            frame = DeferredRenderer(options, device="cpu").frame(shot)
+            count = options.environment_shadows
+            regions = EnvironmentRegions.of(shot.environment, count).turned(ROTATION) if count else None
+            yield Golden(name, lighting, shot, frame, frame.image(), regions)
 
 
 @cache
@@ -251,10 +264,13 @@ class Maps:
 
 
 def shadow_maps(golden: Golden) -> Maps:
-    """Return the shadow maps of a case; none without lamps."""
+    """Return the shadow maps of a case, those of regions after those of lamps; none without either."""
     casters = ShadowCasters.of(golden.shot.cloud)
     views = [light_views(light, casters, MAP_SIZE) for light in golden.shot.lights]
     every = [view for of_light in views for view in of_light]
+    if golden.regions:
+        pairs = zip(golden.regions.directions, golden.regions.half_angles, strict=True)
+        every += [distant_view(direction, float(half), casters, MAP_SIZE) for direction, half in pairs]
     if not every:
         return Maps([], np.zeros((0, MAP_SIZE, MAP_SIZE, 4), np.float32), 0.0, 0.0, [])
     drawer = ShadowDrawer(len(golden.shot.cloud), every, casters=casters, taps=TAPS, device="cpu")

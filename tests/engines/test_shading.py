@@ -1,12 +1,13 @@
 """The shading source of engines: its constants, its generated texts, its functions in float64, and whole pictures."""
 
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from engines.harness import generate, missing, packed, program, psnr
-from engines.probes import PROBES, SIDE, TAPS, goldens
+from engines.probes import ENVIRONMENTS, PROBES, REGIONS, SIDE, TAPS, goldens
 
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.tone import TRANSFORMS, display_linear
@@ -14,6 +15,7 @@ from beam_warp.kernels.light import brdf, lights, scattering, shading
 from beam_warp.kernels.render import shadow_maps
 from beam_warp.light.ggx import TABLE_SIZE, ggx_distribution, schlick_weight, smith_lambda
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS
+from beam_warp.render.arriving import LIGHT_TAPS, REGION_TAPS
 from beam_warp.world.environment import texel_directions
 
 TARGETS = ["wgsl", *(pytest.param(target, marks=pytest.mark.slow) for target in ("hlsl", "glsl"))]
@@ -60,7 +62,8 @@ def test_constants_are_those_of_the_kernels():
     assert found.pop("LOG_RATIO") == pytest.approx(ratio, rel=1e-7)
     assert found.pop("FIRST_ROUGHNESS") == LEVEL_ROUGHNESS[1]
     assert (found.pop("LEVEL_COUNT"), found.pop("TABLE_SIZE")) == (len(LEVEL_ROUGHNESS), TABLE_SIZE)
-    assert (found.pop("SEARCH_TAPS"), found.pop("FILTER_TAPS")) == TAPS
+    assert (found.pop("SEARCH_TAPS"), found.pop("FILTER_TAPS")) == TAPS == LIGHT_TAPS
+    assert (found.pop("REGION_SEARCH_TAPS"), found.pop("REGION_FILTER_TAPS")) == REGION_TAPS
     assert [found.pop(name.upper()) for name in TRANSFORMS] == [0, 1, 2, 3]
     assert found == {"WHITEST": 2.0**24}
 
@@ -157,3 +160,25 @@ def cases(name):
 def test_pictures_are_those_of_the_deferred_renderer(ready, name):
     found = {golden.lighting: psnr(ready(rows, SIDE * SIDE), golden) for golden, rows in cases(name)}
     assert min(found.values()) > ENOUGH, found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["wgsl", "hlsl", "glsl"])
+@pytest.mark.parametrize("name", PROBES)
+def test_regions_of_environments_cast_the_deferred_renderer_s_shadows(name, target, tmp_path):
+    lacking = missing(target)
+    if lacking:
+        pytest.skip(lacking)
+    found, every = {}, list(goldens([name], ENVIRONMENTS, REGIONS))
+    with program(target, "arrivedAt", tmp_path) as lit:
+        arrived = [lit(packed(golden), len(golden.shot.cloud)) for golden in every]
+    with program(target, "shadedPixel", tmp_path) as shaded:
+        for golden, light in zip(every, arrived, strict=True):
+            values = golden.frame.gaussians.values
+            rows = values.numpy()
+            rows[:, 8:] = light
+            values.assign(rows)
+            drawn = packed(replace(golden))  # without the buffer of what the renderer found to arrive
+            found[golden.lighting] = psnr(shaded(drawn, SIDE * SIDE), golden)
+            assert np.abs(light[:, 3] - golden.shot.cloud.ambient_occlusion).max() > 0.05, golden.lighting
+    assert min(found.values()) > 40.0, found

@@ -1,6 +1,6 @@
 """What `test_addon.py` runs in Blender: ``python inside_blender.py JOB.json`` writes arrays and facts beside the job.
 
-The add-on is installed from its zip, as a user does it.
+The add-on is installed from its zip, as a user does it. A job that names an ``engine`` renders the disc by it, no more.
 """
 
 import json
@@ -30,7 +30,7 @@ def refused(path):
         return str(error)
 
 
-def rendered(path, size, samples):
+def rendered(path, size, samples, engine="CYCLES"):
     """Radiance and alpha of a square picture of the scene, from above and 4 m wide, under white light."""
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -39,11 +39,12 @@ def rendered(path, size, samples):
     world = bpy.data.worlds.new("white")
     world.use_nodes = True
     world.node_tree.nodes["Background"].inputs[0].default_value = (1.0, 1.0, 1.0, 1.0)
-    scene.camera, scene.world, scene.render.engine = camera, world, "CYCLES"
+    scene.camera, scene.world, scene.render.engine = camera, world, engine
     render = scene.render
     render.resolution_x = render.resolution_y = size
     render.film_transparent, scene.cycles.pixel_filter_type = True, "BOX"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = samples, False, False
+    scene.eevee.taa_render_samples, render.filter_size = samples, 0.01
     render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
     render.image_settings.color_mode, render.filepath = "RGBA", str(path)
     bpy.ops.render.render(write_still=True)
@@ -51,6 +52,12 @@ def rendered(path, size, samples):
 
 bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.extensions.package_install_files(filepath=JOB["addon"], repo="user_default", enable_on_install=True)
+if "engine" in JOB:
+    bpy.ops.import_scene.relightable(filepath=JOB["disc"])
+    names = [each.identifier for each in bpy.types.RenderSettings.bl_rna.properties["engine"].enum_items]
+    engine = next(name for name in names if name.startswith(JOB["engine"]))
+    rendered(FOLDER / f"{JOB['engine']}.exr", JOB["size"], JOB["samples"], engine)
+    sys.exit()
 scene = bpy.context.scene
 scene.render.fps = 5  # the take has 10 frames a second
 facts = {"menu": any("relightable" in draw.__module__ for draw in bpy.types.TOPBAR_MT_file_import._dyn_ui_initialize())}
@@ -78,6 +85,6 @@ facts["problem"] = thing.relightable.problem
 bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.preferences.addon_enable(module="bl_ext.user_default.beam_relightable")
 bpy.ops.import_scene.relightable(filepath=JOB["disc"])
-rendered(FOLDER / "disc.exr", JOB["size"], 64)
+rendered(FOLDER / "disc.exr", JOB["size"], JOB["samples"])
 np.savez(FOLDER / "frames.npz", **frames)
 (FOLDER / "facts.json").write_text(json.dumps(facts))

@@ -47,7 +47,10 @@ def session(request, addon, tmp_path_factory):
     facts = json.loads((folder / "facts.json").read_text())
     picture = read_image(folder / "disc.exr").linear_rgba()
     bound = Container(folder / "gone").manifest["bounds"]["positions"]
-    return SimpleNamespace(bound=bound, facts=facts, frames=np.load(folder / "frames.npz"), picture=picture)
+    return SimpleNamespace(
+        bound=bound, facts=facts, frames=np.load(folder / "frames.npz"), picture=picture, folder=folder, job=job,
+        python=request.param, environment=os.environ | homes,
+    )  # fmt: skip
 
 
 def test_it_is_in_the_menu_and_takes_dropped_files(session):
@@ -89,14 +92,32 @@ def test_what_cannot_be_read_is_refused_in_one_line(session):
 
 
 def test_cycles_sees_a_gaussian_that_white_light_leaves_white(session):
-    """Alpha is the closed form o exp(-r²/2); a white surface in a white furnace returns its light, to what Principled
-    leaves out of it: at most the 4 % of the coat's second bounce."""
+    """A white surface in a white furnace returns its light, to what Principled leaves out of it: at most the 4 % of the
+    coat's second bounce."""
+    check_disc(session.picture)
+
+
+def test_eevee_sees_the_same(session):
+    """EEVEE draws with OpenGL, which Mesa offers without a screen and without a graphics card."""
+    job = session.folder / "eevee.json"
+    job.write_text(json.dumps(session.job | {"engine": "BLENDER_EEVEE"}))
+    graphics = {"LIBGL_ALWAYS_SOFTWARE": "1", "EGL_PLATFORM": "surfaceless"}
+    command = [session.python, str(Path(__file__).with_name("inside_blender.py")), str(job)]
+    done = subprocess.run(command, env=session.environment | graphics, capture_output=True, text=True, timeout=900)
+    if done.returncode != 0 and "GPU context" in done.stdout + done.stderr:
+        pytest.skip("EEVEE finds no OpenGL here (Debian: libegl1, libgl1-mesa-dri)")
+    assert done.returncode == 0, done.stdout + done.stderr
+    check_disc(read_image(session.folder / "BLENDER_EEVEE.exr").linear_rgba())
+
+
+def check_disc(picture):
+    """Fail unless alpha is the closed form o exp(-r²/2), and what is seen is white."""
     fine = (np.arange(8 * SIZE) + 0.5) / (8 * SIZE) * 4.0 - 2.0
     square = (fine[:, None] ** 2 + fine**2) / SIGMA**2
     alpha = OPACITY * np.exp(-square / 2.0)
     alpha = np.where(alpha < 1.0 / 255.0, 0.0, alpha).reshape(SIZE, 8, SIZE, 8).mean(axis=(1, 3))
     noise = np.sqrt(alpha * (1.0 - alpha) / SAMPLES)
-    found = session.picture[..., 3]
+    found = picture[..., 3]
     assert (np.abs(found - alpha) <= 4.5 * noise + 1e-3).all()
     seen = found > 0.3
-    assert np.allclose(session.picture[seen][:, :3] / found[seen][:, None], 1.0, atol=0.04)
+    assert np.allclose(picture[seen][:, :3] / found[seen][:, None], 1.0, atol=0.04)

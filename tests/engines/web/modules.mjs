@@ -4,6 +4,7 @@ import {Take} from "../../../engines/web/b4d.js";
 import {prefilterWorker, readHdr} from "../../../engines/web/environment.js";
 import {checkedLights, lampNumbers, mapNumbers, shadowViews} from "../../../engines/web/lights.js";
 import {sortingWorker} from "../../../engines/web/sorting.js";
+import {Segments} from "../../../engines/web/segments.js";
 import {toWgsl} from "../../../engines/web/gpu.js";
 
 const floats = (list) => Float32Array.from(list);
@@ -31,6 +32,49 @@ const jobs = {
   take: async ({path}) => {
     const bytes = readFileSync(path), take = await Take.from(bytes);
     return (await take.frame(take.manifest.frames - 1)).positions.length;
+  },
+  damage: async ({path, cuts, flips}) => {
+    const whole = readFileSync(path), cut = cuts.map((at) => whole.subarray(0, at));
+    const changed = flips.map((at) => Uint8Array.from(whole, (byte, i) => i === at ? byte ^ 255 : byte)), found = [];
+    for (const bytes of [whole, ...cut, ...changed]) {
+      try {
+        const take = await Take.from(bytes);
+        for (let frame = 0; frame < take.manifest.frames; frame++) await take.frame(frame);
+        found.push("whole");
+      } catch (error) {
+        found.push(error.constructor.name);
+      }
+    }
+    return found;
+  },
+  /** Play a take of six segments of ten frames, of which each step wants one; says what is here, and what happened. */
+  segments: async ({most, steps}) => {
+    const broken = new Set(), waiting = [], told = [], unpacked = [];
+    let clock = 0, isSlow = false;
+    globalThis.performance = {now: () => clock};
+    const entries = Array.from({length: 6}, (_, k) => ({first: 10 * k, frames: 10, file: `${k}`}));
+    const take = {manifest: {segments: entries}, async tracks({file}, _, unpack, signal) {
+      if (isSlow) await new Promise((resolve, reject) => { waiting.push(resolve); signal.addEventListener("abort", () => reject(new Error("aborted"))); });
+      if (broken.has(Number(file))) throw new Error("out of reach");
+      return (await unpack(file)).tracks;
+    }};
+    const owner = {most, store: async (number, entry) => { unpacked.push(number); return {number, entry, bytes: 100}; }, free() {},
+      tell: (type, {segment}) => told.push(`${type} ${segment}`)};
+    const segments = new Segments(take, owner, {ask: async () => ({tracks: {}}), end() {}}), answers = [];
+    const settle = () => new Promise((resolve) => setTimeout(resolve, 1));
+    for (const {want, breaks, mends, passes = 0, slow, flows, nearest} of steps) {
+      clock += passes;
+      isSlow = slow ?? isSlow;
+      if (breaks !== undefined) broken.add(breaks);
+      if (mends !== undefined) broken.delete(mends);
+      if (want !== undefined) segments.want(want);
+      if (flows) while (waiting.length) { waiting.shift()(); await settle(); }
+      for (let k = 0; k < 9; k++) await settle();
+      const place = nearest === undefined ? null : segments.nearest(nearest);
+      answers.push({here: entries.map((_, k) => k).filter((k) => segments.has(k)), told: told.splice(0), unpacked: unpacked.splice(0),
+        nearest: place && [place.number, place.local, place.distance]});
+    }
+    return answers;
   },
   wgsl: ({source}) => toWgsl(source),
 };

@@ -6,19 +6,23 @@ import re
 import shutil
 import struct
 import subprocess
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from engines.web.pages import MODULE
+from support.drawn_ball import relightable
 
 from beam_warp._version import __version__
+from beam_warp.converters import WriteOptions, write
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.prefiltered import blurred_environment
 from beam_warp.light.uploaded import ROWS
 from beam_warp.render.shadow_maps import LARGEST_KERNEL, ShadowCasters, light_views
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.framing import bulk
+from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.lights import lights_from_json
 
 NODE = shutil.which("node")
@@ -171,6 +175,56 @@ def test_bytes_that_are_no_container_are_refused_in_words(tmp_path):
     )
     found = run(*({"job": "take", "path": str(tmp_path / name)} for name in ("a.b4d", "b.b4d")))
     assert all(re.match(r"DeliveryError: .* must be .*, got", each["error"]) for each in found), found
+
+
+@needs_node
+def test_a_container_that_was_cut_or_altered_is_refused_and_never_crashes_the_reader(tmp_path):
+    rng = np.random.default_rng(7)
+    clouds = [relightable(rng.normal(size=(50, 3))).with_arrays(ids=np.arange(50)) for _ in range(14)]
+    path = tmp_path / "a.b4d"
+    write(GaussianSequence.from_clouds(clouds, frames_per_second=10.0), path, WriteOptions())
+    size = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:  # after the blocks comes zip's directory, which players do not read
+        end = archive.start_dir
+    cuts = [*range(0, 60, 7), *np.linspace(60, end - 1, 40).astype(int).tolist()]
+    flips = [*range(0, 60, 3), *np.linspace(60, size - 1, 60).astype(int).tolist()]
+    (found,) = run({"job": "damage", "path": str(path), "cuts": cuts, "flips": flips})
+    assert found[0] == "whole"
+    assert set(found) == {"whole", "DeliveryError"}
+    assert "whole" not in found[1 : 1 + len(cuts)]
+
+
+@needs_node
+def test_segments_are_kept_within_a_bound_and_what_is_not_wanted_any_more_is_not_unpacked():
+    steps = [
+        {"want": 0, "nearest": 57},  # two segments are read ahead
+        {"want": 4, "breaks": 5},
+        {"want": 5},
+        {"want": 5, "mends": 5},
+        {"want": 5, "passes": 2001},
+        {"want": 0, "slow": True},
+        {"want": 3},
+        {"want": 0},
+        {"want": 3},
+        {"flows": True, "slow": False, "nearest": 29},
+    ]
+    found, tight = run(
+        {"job": "segments", "most": 450, "steps": steps},
+        {"job": "segments", "most": 0, "steps": [{"want": 0}, {"want": 3}]},
+    )
+    assert found[0] == {"here": [0, 1, 2], "told": [], "unpacked": [0, 1, 2], "nearest": [2, 9, 28]}
+    assert 4 in found[1]["here"]
+    assert found[1]["told"] == [], "what cannot be read ahead is nobody's loss yet"
+    assert found[2]["told"] == ["stalled 5"]
+    assert found[3]["told"] == [], "it is asked for again after a while"
+    assert found[4]["told"] == ["resumed 5"]
+    assert len(found[4]["here"]) == 4, "450 bytes hold four"
+    assert [step["told"] for step in found[5:]] == [[]] * 5, "what was given up is no loss"
+    assert found[9]["unpacked"] == [3]
+    assert 3 in found[9]["here"]
+    assert max(len(step["here"]) for step in found) <= 4
+    assert found[9]["nearest"][0] == 3
+    assert [step["here"] for step in tight] == [[0, 1], [3, 4]], "one that is read ahead has to be kept"
 
 
 @needs_node

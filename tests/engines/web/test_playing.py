@@ -116,16 +116,18 @@ def test_a_lost_segment_holds_the_last_frame_and_says_so_until_it_is_back(browse
         f"""async () => {{ {PRELUDE}
         window.made = await make({{backend: "webgl2"}});
         await made.open(await Take.open("/take.b4d"));
-        made.time = 0.2;
+        made.time = 1.1; // the last frame of the first segment
         await made.render(camera);
         const before = packed(await made.read());
+        made.time = 0.2;
+        await made.render(camera);
         made.time = 1.5;
-        const drawn = await made.render(camera);
-        return [drawn, before === packed(await made.read()), heard]; }}"""
+        const drawn = await made.render(camera); // the nearest frame at hand, while one may hope, and then held
+        return [drawn, made.shownTime, before === packed(await made.read()), heard]; }}"""
     )
-    assert held[:2] == [True, True]
-    assert held[2][0][0] == "stalled"
-    assert "must have the digest" in held[2][0][1]
+    assert held[:3] == [True, 1.1, True]
+    assert held[3][0][0] == "stalled"
+    assert "must have the digest" in held[3][0][1]
     files["take.b4d"] = whole
     said, moved = page.evaluate(
         f"""async () => {{ {PRELUDE}
@@ -228,7 +230,7 @@ window.played = (async () => {
 
 
 def test_a_page_from_a_file_plays_a_take_from_its_bytes(browser, take, tmp_path):
-    order = ("b4d", "gpu", "environment", "lights", "sorting", "shaders", "shading", "relight", "index")
+    order = ("b4d", "gpu", "environment", "lights", "sorting", "segments", "shaders", "shading", "relight", "index")
     sources = json.dumps({name: (MODULE / f"{name}.js").read_text(encoding="utf-8") for name in order})
     text = FILE_PAGE.replace("BYTES", base64.b64encode(take.read_bytes()).decode()).replace("PRELUDE", PRELUDE)
     file = tmp_path / "page.html"

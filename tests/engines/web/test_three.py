@@ -1,4 +1,4 @@
-"""A take in a scene of three.js: depth, lamps, environment, and shadows both ways."""
+"""A take in a scene of three.js, by both of its renderers: depth, lamps, environment, and shadows both ways."""
 
 import npm_packages
 import numpy as np
@@ -17,14 +17,21 @@ pytestmark = [
 ]
 
 SIDE = 128
-START = """<!doctype html><script type="importmap">{"imports": {"three": "/three.module.js"}}</script>
+BUILDS = ("three.module.js", "three.core.js", "three.webgpu.js", "three.tsl.js")
+START = """<!doctype html><script type="importmap">
+{"imports": {"three": "/three.module.js", "three/webgpu": "/three.webgpu.js", "three/tsl": "/three.tsl.js"}}</script>
 <script type="module">
 import * as THREE from "three";
+import {WebGPURenderer} from "three/webgpu";
 import {RelightObject} from "/module/three.js";
 import {Take} from "/module/index.js";
 window.packed = (numbers) => btoa(String.fromCharCode(...numbers));
-window.stage = async () => {
-  const renderer = new THREE.WebGLRenderer({antialias: false, preserveDrawingBuffer: true});
+window.stage = async (kind) => {
+  const renderer = kind === "webgl" ? new THREE.WebGLRenderer({antialias: false, preserveDrawingBuffer: true})
+    : new WebGPURenderer({antialias: false, requiredLimits: {maxColorAttachmentBytesPerSample: 64}});
+  const target = kind === "webgl" ? null : new THREE.RenderTarget(SIDE, SIDE);
+  await renderer.init?.();
+  renderer.setRenderTarget(target);
   renderer.setSize(SIDE, SIDE, false);
   renderer.shadowMap.enabled = true;
   document.body.append(renderer.domElement);
@@ -55,8 +62,18 @@ window.stage = async () => {
     for (let k = 0; k < 3; k++) {
       renderer.render(scene, camera);
       await ball.ready();
+      await new Promise(requestAnimationFrame); // WebGPURenderer draws shadow maps once an animation frame
     }
     renderer.render(scene, camera);
+    if (target) { // in linear light, top row first
+      const light = await renderer.readRenderTargetPixelsAsync(target, 0, 0, SIDE, SIDE);
+      const pixels = new Uint8Array(light.length);
+      for (let i = 0; i < light.length; i++) {
+        const row = Math.floor(i / (4 * SIDE));
+        pixels[(SIDE - 1 - 2 * row) * 4 * SIDE + i] = Math.round(255 * (light[i] / 255) ** (1 / 2.2));
+      }
+      return packed(pixels);
+    }
     const gl = renderer.getContext(), pixels = new Uint8Array(4 * SIDE * SIDE);
     gl.readPixels(0, 0, SIDE, SIDE, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
     if (gl.getError()) throw new Error("WebGL complains");
@@ -68,8 +85,8 @@ window.isThere = true;
 </script>""".replace("SIDE", str(SIDE))
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
+@pytest.fixture(scope="module", params=["webgl", "webgpu"])
+def page(request, tmp_path_factory):
     try:
         three = npm_packages.packages() / "three" / "build"
     except npm_packages.MissingPackagesError as error:
@@ -86,11 +103,12 @@ def page(tmp_path_factory):
         path,
         WriteOptions(),
     )
-    files = {name: three / name for name in ("three.module.js", "three.core.js")} | {"ball.b4d": path}
+    files = {name: three / name for name in BUILDS} | {"ball.b4d": path}
     assert (MODULE / "three.js").is_file()
     with chromium() as browser:
         opened = open_page(browser, files, START)
-        opened.evaluate("stage().then((made) => { Object.assign(window, made); })")
+        opened.evaluate("(kind) => stage(kind).then((made) => { Object.assign(window, made); })", request.param)
+        assert opened.evaluate("ball.relight.backend") == {"webgl": "webgl2", "webgpu": "webgpu"}[request.param]
         yield opened
 
 
@@ -130,6 +148,15 @@ def test_gaussians_cast_shadows_on_meshes(page):
     darker = (shadowed < 0.7 * without - 0.01).all(axis=-1)
     assert 0.01 < darker.mean() < 0.2, "a spot of the ground is dark"
     assert darker[: SIDE // 3].mean() < 0.01
+
+
+def test_what_draws_the_gaussians_casts_no_shadow_itself(page):
+    """The triangle over the whole view would, to a lamp behind it."""
+    shadowed = shown(page, "sun.position.z = -2")
+    without = shown(page, "ball.castShadow = false")
+    page.evaluate("ball.castShadow = true; sun.position.z = 2")
+    darker = (shadowed < 0.7 * without - 0.01).all(axis=-1)
+    assert 0.01 < darker.mean() < 0.2
 
 
 def test_meshes_cast_shadows_on_gaussians(page):

@@ -71,6 +71,18 @@ float4 shadowTexel(int map, int2 cell)
     return float4(min(sums.w, 1.0), first > 0.0 ? first : mean, mean, mesh);
 }
 
+int regionCount()
+{
+    return 0; // ambient occlusion stands for the environment's shadows
+}
+
+Region regionAt(int k)
+{
+    Region region = (Region)0;
+    region.map = k;
+    return region;
+}
+
 Lamp lampAt(int k)
 {
     float4 place = _BeamLamps[4 * k];
