@@ -49,8 +49,9 @@ from beam_warp.evaluate.views import ViewScorer
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.roughness import measure_roughness_profile, solve_roughness
 from beam_warp.mesh.distances import surface_distances

@@ -30,7 +30,8 @@ from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialMeasurement, MaterialOptions, measure_materials
+from beam_warp.materials.direct import MaterialMeasurement, measure_materials
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.pilot import rays_needed
 from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.trace.occlusion import ambient_occlusion

@@ -25,7 +25,7 @@ from timing import Task, spread, take_turns
 from beam_warp import Scene, ambient_occlusion, converters, visibility
 from beam_warp.decomposition.job import RunOptions, run
 from beam_warp.device.arrays import resolve_device
-from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import estimate_normals
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.reference import visibility_reference

@@ -28,9 +28,9 @@ from beam_warp.evaluate.sheet import evaluation_sheet
 from beam_warp.evaluate.views import ScoredView
 from beam_warp.image.files import write_png
 from beam_warp.image.metrics import Score, compare
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.images import ImagePathOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.roughness import RoughnessEstimate, measure_roughness_profile, solve_roughness
 from beam_warp.raster.records import RasterOptions

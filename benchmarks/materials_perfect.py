@@ -13,7 +13,8 @@ from parts import Row
 
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.reconstruction.scores import truth_frames
 
 

@@ -18,9 +18,10 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh

@@ -22,7 +22,7 @@ from beam_warp.capture.matching import match_frames
 from beam_warp.demo.figure import build_figure
 from beam_warp.device.arrays import resolve_device
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap

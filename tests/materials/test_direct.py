@@ -11,8 +11,9 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials, view_set
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.exposure import estimate_exposure
+from beam_warp.materials.light_rays import MaterialOptions, view_set
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
