@@ -107,13 +107,13 @@ def draw_cost(part: Row, path: Path) -> None:
 
 
 def draw_sheet(sheet: Path, path: Path) -> None:
-    """Write a sheet that the evaluation drew, smaller and with a palette: it lies in the repository."""
+    """Write a sheet that the evaluation drew, smaller: it lies in the repository."""
     from PIL import Image
 
     with Image.open(sheet) as picture:
         small = picture.convert("RGB")
         small.thumbnail((SHEET_WIDTH, small.height))
-        small.quantize(128).save(path, optimize=True)
+        small.save(path)
 
 
 def _bars(axes: Any, labels: Sequence[str], values: Sequence[float], colors: Sequence[str]) -> None:

@@ -17,7 +17,7 @@ import re
 import subprocess
 import sys
 import tokenize
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,10 @@ CANNOT_CHANGE_A_NUMBER = (
 """Code that computes nothing: messages, progress, options; names of constants, which each row repeats."""
 
 
+DIGITS = 8
+"""Hexadecimal digits of a file's digest: enough to see that it has changed."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what every benchmark takes: where the result goes, and of which commit it is."""
     parser.add_argument(
@@ -70,7 +74,7 @@ def write_result(arguments: argparse.Namespace, device: Any, result: Mapping[str
         "date": datetime.now(UTC).date().isoformat(),
         "machine": machine(device),
         "versions": versions(),
-        "code": loaded_code(),
+        "code": by_folder(loaded_code()),
     }
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     partial = arguments.out.with_suffix(".partial")
@@ -129,12 +133,30 @@ def loaded_code() -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def by_folder(code: Mapping[str, str]) -> dict[str, str]:
+    """Return digests of files as a result file has them: ``{"beam_warp/world": "axes:cad7f293 camera:ec1f0425"}``."""
+    found: dict[str, str] = {}
+    for place, digest in code.items():
+        folder, _, name = place.removesuffix(".py").rpartition("/")
+        found[folder] = f"{found[folder]} {name}:{digest}" if folder in found else f"{name}:{digest}"
+    return found
+
+
+def _digests(code: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield files and digests of a result: its keys are folders (`by_folder`), or files."""
+    for place, said in code.items():
+        if place.endswith(".py"):
+            yield place, said
+        else:
+            yield from ((f"{place}/{name}.py", digest) for name, digest in (word.split(":") for word in said.split()))
+
+
 def changed_since(measured: Mapping[str, Any]) -> list[str]:
     """Return the files whose code is no longer what was measured; files that are gone are among them."""
     return [
         place
-        for place, digest in measured["code"].items()
-        if not place.startswith(CANNOT_CHANGE_A_NUMBER) and _digest_of_file(ROOT / place) != digest
+        for place, digest in _digests(measured["code"])
+        if not place.startswith(CANNOT_CHANGE_A_NUMBER) and _digest_of_file(ROOT / place) != digest[:DIGITS]
     ]
 
 
@@ -144,7 +166,7 @@ def _digest_of_file(path: Path) -> str | None:
 
 
 def code_digest(source: str) -> str:
-    """Return a digest of Python source without its comments, docstrings and blank lines, 12 hexadecimal digits."""
+    """Return a digest of Python source without its comments, docstrings and blank lines, `DIGITS` hexadecimal digits."""
     lines = source.splitlines()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
@@ -155,7 +177,7 @@ def code_digest(source: str) -> str:
             last = node.end_lineno or node.lineno
             lines[node.lineno - 1 : last] = [""] * (last - node.lineno + 1)
     code = "\n".join(line.rstrip() for line in lines if line.strip())
-    return hashlib.sha256(code.encode()).hexdigest()[:12]
+    return hashlib.sha256(code.encode()).hexdigest()[:DIGITS]
 
 
 def content_digest(path: Path) -> str:
