@@ -15,7 +15,6 @@ few Gaussians and a handful of constants. This is about scores only: no time is 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
@@ -485,14 +484,10 @@ def measure(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
-    parser.add_argument("--device", help="cpu or cuda:0; the first GPU, or the CPU, without")
+    parser = record.parser(__doc__, device=None, data=True, quick="the demo's capture and a handful of constants")
     parser.add_argument("--workers", type=int, default=6, help="processes that share the device")
     parser.add_argument("--seconds", type=float, help="begin no row after so long")
     parser.add_argument("--only", nargs="+", choices=list(GROUPS), default=[], metavar="GROUP")
-    parser.add_argument("--quick", action="store_true", help="the demo's capture and a handful of constants")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     until = time.monotonic() + (arguments.seconds or math.inf)
     device = resolve_device(arguments.device)

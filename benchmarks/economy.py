@@ -12,8 +12,6 @@ many rays for each, whose sets begin alike. Seconds are of measuring all materia
 
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -172,14 +170,11 @@ def occlusion_of(subject: Subject, rays: int) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Measure every subject and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
-    parser.add_argument("--device", default="cpu")
+    parser = record.parser(__doc__, device="cpu", data=True)
     parser.add_argument("--captures", nargs="+", default=CAPTURES, choices=CAPTURES)
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--reference-rays", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=REPEATS)
-    record.add_arguments(parser)
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}

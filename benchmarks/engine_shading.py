@@ -9,7 +9,6 @@ that our rasteriser drew, so that what differs is arithmetic. A target whose too
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -33,9 +32,8 @@ BEHIND = (0.25, 0.25, 0.25)
 
 def main() -> int:
     """Measure every target, and write the result."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record.parser(__doc__)
     parser.add_argument("--picture", type=Path, metavar="WEBP", help="the truth of all cases in one picture")
-    record.add_arguments(parser)
     args = parser.parse_args()
     cases = list(goldens())
     rows: list[dict[str, Any]] = [

@@ -12,8 +12,6 @@ the same mean, in turn; what is said of each.
 
 from __future__ import annotations
 
-import argparse
-import os
 from pathlib import Path
 from typing import Any
 
@@ -127,10 +125,7 @@ def highlight_scales(evidence: LightEvidence, light: EnvironmentMap) -> dict[str
 
 def main() -> None:
     """Ask every capture and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
-    parser.add_argument("--device", default="cpu")
-    record.add_arguments(parser)
+    parser = record.parser(__doc__, device="cpu", data=True)
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}

@@ -5,7 +5,7 @@ Images are drawn by the rasteriser once, before the clock starts, and lie in mem
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from device_memory import peak_memory
 from materials_contenders import OURS, Method, Subject, SubjectFrame, by_images, direct
 from materials_truth import SHARP
-from parts import Row
+from parts import Row, say
 from timing import spread
 
 from beam_warp.capture.capture import Capture
@@ -78,9 +78,7 @@ def drawn_views(cloud: GaussianCloud, cameras: Sequence[Camera], device: Any) ->
     return views
 
 
-def measure_cost(
-    capture: Capture, light: PreparedEnvironment, scale: Scale, device: Any, say: Callable[[str], None]
-) -> Iterable[tuple[str, Row]]:
+def measure_cost(capture: Capture, light: PreparedEnvironment, scale: Scale, device: Any) -> Iterable[tuple[str, Row]]:
     """Yield the scene and what each way costs on it, each as soon as it is measured."""
     cloud = figure(capture, scale.gaussians, device)
     width, height = scale.size

@@ -13,11 +13,12 @@ import functools
 import hashlib
 import io
 import json
+import os
 import re
 import subprocess
 import sys
 import tokenize
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -51,12 +52,30 @@ DIGITS = 8
 """Hexadecimal digits of a file's digest: enough to see that it has changed."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every benchmark takes: where the result goes, and of which commit it is."""
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="JSON", help="what is written, for tables.py to print"
-    )
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
+def parser(
+    about: str | None, *, device: str | None = "", data: bool = False, quick: str = "", parts: Iterable[str] = ()
+) -> argparse.ArgumentParser:
+    """Return a parser with what benchmarks have in common; ``--out`` and ``--commit`` in any case.
+
+    Args:
+        about: The program's docstring.
+        device: Default of ``--device``: None is the first GPU, or the CPU; an empty text leaves the option out.
+        data: Whether there is ``--data``, the folder of captures.
+        quick: What ``--quick`` does; empty leaves it out.
+        parts: What ``--parts`` chooses from; empty leaves it out.
+    """
+    made = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--out", type=Path, required=True, metavar="JSON", help="what is written, for tables.py to print")
+    made.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
+    if device != "":
+        made.add_argument("--device", default=device, help="cpu or cuda:0")
+    if data:
+        made.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", ROOT.parent / "shared/data")))
+    if quick:
+        made.add_argument("--quick", action="store_true", help=quick)
+    if parts:
+        made.add_argument("--parts", nargs="+", default=(), choices=parts, metavar="PART", help="these parts only")
+    return made
 
 
 def write_result(arguments: argparse.Namespace, device: Any, result: Mapping[str, Any]) -> None:
@@ -166,7 +185,7 @@ def _digest_of_file(path: Path) -> str | None:
 
 
 def code_digest(source: str) -> str:
-    """Return a digest of Python source without its comments, docstrings and blank lines, `DIGITS` hexadecimal digits."""
+    """Return the `DIGITS` digits of Python source without its comments, docstrings and blank lines."""
     lines = source.splitlines()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:

@@ -16,7 +16,6 @@ their images, stand for base colours. Defaults were chosen on the figure alone.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import os
 import subprocess
@@ -30,11 +29,11 @@ from typing import Any
 
 import npm_packages
 import numpy as np
-import parts
 import record
 import warp as wp
 from delivery_take import take
 from numpy.typing import NDArray
+from parts import measure, say
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -79,9 +78,6 @@ class Bench:
     options: ReduceOptions
     assets: tuple[str, ...]
     device: Any
-
-    def say(self, line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
 
 
 def asset(name: str, bench: Bench) -> GaussianSequence:
@@ -201,7 +197,7 @@ def sizes(bench: Bench) -> Iterator[Row]:
                     rows.append(row | contend(keep, reducer, cloud, round(share * len(cloud)), comparison, draws))
                 except (npm_packages.MissingPackagesError, subprocess.SubprocessError) as error:
                     rows.append(row | {"absent": str(error)})
-                bench.say(f"{rows[-1]['name']}: {rows[-1].get('refit', {}).get('psnr')}")
+                say(f"{rows[-1]['name']}: {rows[-1].get('refit', {}).get('psnr')}")
                 yield {"rows": rows, "height": bench.options.height, "tests": bench.tests}
 
 
@@ -228,12 +224,8 @@ PARTS = {"sizes": sizes}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the figure, small, a few steps")
-    parser.add_argument("--device", default="cpu", help="cpu, cuda:0, …")
-    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=[], help="measure these only")
+    parser = record.parser(__doc__, device="cpu", quick="the figure, small, a few steps", parts=PARTS)
     parser.add_argument("--assets", nargs="+", default=["figure", *CAPTURES], metavar="NAME")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     count, height, tests, views, steps = (140_000, 320, 64, 96, 600) if device.is_cuda else (3_000, 56, 12, 20, 80)
@@ -243,7 +235,7 @@ def main() -> int:
     shares = (0.2,) if arguments.quick else (0.2, 0.1)
     bench = Bench(count, shares, tests, options, tuple(arguments.assets), device)
     keep = functools.partial(record.write_result, arguments, device)
-    result = parts.measure(PARTS, bench, only=arguments.parts, keep=keep)
+    result = measure(PARTS, bench, only=arguments.parts, keep=keep)
     keep(result)
     return 1 if result["failed"] else 0
 

@@ -22,7 +22,8 @@ GAIN = 4.0
 
 def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> None:
     """Draw deferred, path traced, truth and what the first two differ by, a row a subject."""
-    plt = _pyplot()
+    from matplotlib import pyplot as plt
+
     loaded = []
     for name, subject in subjects.items():
         light = SHOWN_LIGHT if SHOWN_LIGHT in subject["lights"] else list(subject["lights"])[-1]
@@ -55,12 +56,3 @@ def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> 
 def shown_color(image: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Return scene-linear radiance, multiplied by alpha, on black as it is compared: sRGB in [0, 1]."""
     return linear_to_srgb(np.clip(image.astype(np.float64), 0.0, 1.0))
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot

@@ -96,9 +96,6 @@ def sampling_bias(ball: Row, human: Row) -> float:
 @figure("estimators.webp", BALL_AND_FIGURE[0])
 def estimators(result: Row, path: Path) -> None:
     """Draw error against rays, both logarithmic: one panel for occlusion, one a sky."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     counts = result["curve_counts"]

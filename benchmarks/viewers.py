@@ -8,7 +8,6 @@ browser is a headless Chromium that draws in software.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -45,9 +44,8 @@ def look(browser: Any, viewer: Viewer, ending: str, folder: Path) -> tuple[dict[
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record.parser(__doc__)
     parser.add_argument("--picture", type=Path, metavar="WEBP", help="all screenshots in one picture")
-    record.add_arguments(parser)
     args = parser.parse_args()
     rows, panels = [], []
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:

@@ -38,7 +38,7 @@ TINY = replace(
 @pytest.fixture(scope="module")
 def bench(relit_capture):
     def make(device, **changes):
-        made = benchmark.bench_of_capture(relit_capture, resolve_device(device), lambda text: None)
+        made = benchmark.bench_of_capture(relit_capture, resolve_device(device))
         return replace(made, sky=made.sky.resized(16, 32), effort=TINY, **changes)
 
     return make
