@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import record
-from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_reference, rms
+from materials_truth import Materials, PerfectFrame, TruthViews, light_reference, rms
 from numpy.typing import NDArray
 from timing import Task, spread, take_turns
 
@@ -32,6 +32,7 @@ from beam_warp.materials.direct import MaterialMeasurement, measure_materials
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.pilot import rays_needed
 from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.study.true_surface import SHARP
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_batches
 from beam_warp.world.environment import EnvironmentMap

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from materials_bench import Bench
-from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_errors, light_reference, row_of
+from materials_truth import Materials, PerfectFrame, TruthViews, light_errors, light_reference, row_of
 from parts import Row, say
 
 from beam_warp.light.prepared import PreparedEnvironment
@@ -16,6 +16,7 @@ from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.study.true_surface import SHARP
 
 
 def measure_perfect(bench: Bench) -> Iterator[Row]:

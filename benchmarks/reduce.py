@@ -47,12 +47,10 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.reduction.job import ReduceOptions, Reducer
 from beam_warp.reduction.moments import Clusters, changed, shown_area
 from beam_warp.reduction.refit import refit
-from beam_warp.study.materials import SHARP
-from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.study.true_surface import SHARP, surface_of_capture
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.world.axes import change_axes
@@ -86,16 +84,15 @@ def asset(name: str, bench: Bench) -> GaussianSequence:
         ((_, cloud),) = take(build_figure(), bench.count, 1)
         return GaussianSequence.from_clouds([cloud], metadata=RasterOptions(antialiased=True).as_metadata())
     capture = Capture.read(Path(os.environ.get("BEAM_DATA", "../shared/data")) / "captures" / name)
-    mesh, frame = read_truth_mesh(capture, 0), 0
-    views = [entry.view() for entry in capture.select(split="train", frames={frame})]
-    bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), bench.count)
-    colored = colored_by_views(bare, views, options=SHARP, device=str(bench.device))
+    colored, _ = surface_of_capture(capture, 0, bench.count, options=SHARP, device=str(bench.device))
     assert colored.radiance is not None
-    scene = Scene.from_gaussians(bare, str(bench.device))
-    openness = ambient_occlusion(scene, bare.positions, bare.normals, sample_count=64).visibility
-    cloud = bare.with_arrays(
+    scene = Scene.from_gaussians(colored, str(bench.device))
+    openness = ambient_occlusion(scene, colored.positions, colored.normals, sample_count=64).visibility
+    cloud = colored.with_arrays(
+        radiance=None,
+        radiance_color_space=None,
         base_color=np.clip(0.5 + SH_C0 * colored.radiance[:, 0], 0.0, 1.0),
-        roughness=np.full(len(bare), 0.5, np.float32),
+        roughness=np.full(len(colored), 0.5, np.float32),
         ambient_occlusion=np.clip(np.asarray(openness), 0.0, 1.0),
     )
     return GaussianSequence.from_clouds([cloud], metadata=SHARP.as_metadata())

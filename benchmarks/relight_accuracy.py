@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from materials_truth import SHARP, true_cloud
+from materials_truth import true_cloud
 from numpy.typing import NDArray
 from parts import Row, say
 from relight_scenes import Bench, seconds_of
@@ -32,7 +32,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
 from beam_warp.render.path import PathOptions, PathProgress, PathRenderer
-from beam_warp.study.true_surface import gaussians_on_mesh
+from beam_warp.study.true_surface import SHARP, gaussians_on_mesh
 from beam_warp.trace.mesh_paths import TracedMesh, trace_radiance
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
