@@ -6,7 +6,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from beam_warp.cli.charts.flags import (
     TracingChart,
 )
 from beam_warp.cli.charts.subjects import capture_at, light_at, materials_subject, sequence_at
+from beam_warp.cli.common.flags import options_of
 from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.jobs.listeners import NotedProgress
@@ -52,9 +52,12 @@ def measured(args: ChartFlags, report: NotedProgress) -> tuple[Table, list[Setti
     Returns:
         The table, and the settings that the budget left out.
     """
-    require_number("budget-seconds", args.budget_seconds, 0.0)
+    seconds = require_number("budget-seconds", args.budget_seconds, 0.0)
     with tempfile.TemporaryDirectory() as folder:
-        study, seconds = _STUDIES[type(args)](args, Path(folder), report)
+        started = time.perf_counter()
+        study = _STUDIES[type(args)](args, Path(folder), report)
+        if isinstance(args, TracingChart):  # its references count towards the budget
+            seconds = max(seconds - (time.perf_counter() - started), LEAST_PART * seconds)
         make_folders(args.out)
         try:
             return run_study(study, args.out, budget_seconds=seconds, progress=report)
@@ -64,9 +67,9 @@ def measured(args: ChartFlags, report: NotedProgress) -> tuple[Table, list[Setti
             raise
 
 
-def _tracing(args: TracingChart, folder: Path, report: NotedProgress) -> tuple[Study, float]:
-    """Prepare the study of a scene; its references count towards the budget, and are kept with the results."""
-    plan = TracingPlan(**_options_of(args, TracingPlan))
+def _tracing(args: TracingChart, folder: Path, report: NotedProgress) -> Study:
+    """Prepare the study of a scene; its references are kept with the results."""
+    plan = options_of(args, TracingPlan)
     environment, environment_name = light_at(args.environment)
     if args.scene is None:
         cloud, name = still_life(), "the built-in still life"
@@ -75,8 +78,7 @@ def _tracing(args: TracingChart, folder: Path, report: NotedProgress) -> tuple[S
         cloud, name = change_axes(sequence[args.frame], "rfu"), args.scene.name
     resolve_device(args.device)  # an unknown device is refused before a folder is made
     make_folders(args.out)
-    started = time.perf_counter()
-    study = tracing_study(
+    return tracing_study(
         cloud,
         environment,
         plan,
@@ -87,27 +89,25 @@ def _tracing(args: TracingChart, folder: Path, report: NotedProgress) -> tuple[S
         reference_seconds=REFERENCE_PART * args.budget_seconds,
         progress=report,
     )
-    left = args.budget_seconds - (time.perf_counter() - started)
-    return study, max(left, LEAST_PART * args.budget_seconds)
 
 
-def _materials(args: MaterialsChart, folder: Path, report: NotedProgress) -> tuple[Study, float]:
+def _materials(args: MaterialsChart, folder: Path, report: NotedProgress) -> Study:
     """Prepare the study of a capture's materials."""
-    plan = MaterialsPlan(**_options_of(args, MaterialsPlan))
+    plan = options_of(args, MaterialsPlan)
     resolve_device(args.device)  # before a capture is built
-    return materials_study(materials_subject(args, folder, report), plan, device=args.device), args.budget_seconds
+    return materials_study(materials_subject(args, folder, report), plan, device=args.device)
 
 
-def _reconstruction(args: ReconstructChart, folder: Path, report: NotedProgress) -> tuple[Study, float]:
+def _reconstruction(args: ReconstructChart, folder: Path, report: NotedProgress) -> Study:
     """Prepare the study of one frame of a capture."""
     resolve_device(args.device)
     capture, name = capture_at(args.capture, folder, args.frame, args.device, report)
     number = capture.frames[require_count("frame", args.frame, 0, len(capture.frames) - 1)]
     options = {option: getattr(args, option) for option in ("gaussians", "schedules", "shares")}
-    return reconstruction_study(capture, number, name=name, device=args.device, **options), args.budget_seconds
+    return reconstruction_study(capture, number, name=name, device=args.device, **options)
 
 
-def _rendering(args: RenderChart, folder: Path, report: NotedProgress) -> tuple[Study, float]:
+def _rendering(args: RenderChart, folder: Path, report: NotedProgress) -> Study:
     """Prepare the study of one relit image of an asset."""
     sequence, light = sequence_at(args.asset, args.frame), light_at(args.environment)[0]
     cloud = change_axes(sequence[args.frame], "rfu")
@@ -117,14 +117,13 @@ def _rendering(args: RenderChart, folder: Path, report: NotedProgress) -> tuple[
     )
     shot = Shot(cloud=cloud, camera=camera, environment=light)
     raster = RasterOptions.from_metadata(sequence.metadata)
-    study = relighting_study(shot, raster, name=_name(args), device=args.device, repeats=args.repeats)
-    return study, args.budget_seconds
+    return relighting_study(shot, raster, name=_name(args), device=args.device, repeats=args.repeats)
 
 
-def _delivery(args: DeliveryChart, folder: Path, report: NotedProgress) -> tuple[Study, float]:
+def _delivery(args: DeliveryChart, folder: Path, report: NotedProgress) -> Study:
     """Prepare the study of an asset's size."""
     sequence, light = sequence_at(args.asset, args.frame), light_at(args.environment)[0]
-    study = delivery_study(
+    return delivery_study(
         sequence,
         light,
         name=_name(args),
@@ -133,24 +132,17 @@ def _delivery(args: DeliveryChart, folder: Path, report: NotedProgress) -> tuple
         flip=PerceptualMetrics.installed().measures.get("flip"),
         device=args.device,
     )
-    return study, args.budget_seconds
 
 
 def _name(args: RelitChart) -> str:
     return args.asset.name if args.asset is not None else ""
 
 
-def _options_of(args: TracingChart | MaterialsChart, plan: type) -> dict[str, Any]:
-    """Return the options that a plan has by the same names."""
-    return {option.name: getattr(args, option.name) for option in fields(plan)}
-
-
-_STUDIES: dict[type, Callable[[Any, Path, NotedProgress], tuple[Study, float]]] = {
+_STUDIES: dict[type, Callable[[Any, Path, NotedProgress], Study]] = {
     TracingChart: _tracing,
     MaterialsChart: _materials,
     ReconstructChart: _reconstruction,
     RenderChart: _rendering,
     DeliveryChart: _delivery,
 }
-"""What prepares each chart: it takes the words, a folder for what is built in, and a listener, and returns the study
-and the seconds that are left for measuring."""
+"""What prepares the study of each chart: it takes the words, a folder for what is built in, and a listener."""
