@@ -20,7 +20,7 @@ from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, n
 from beam_warp.cli.common.pages import parse
 from beam_warp.cli.common.paths import paths_checked
 from beam_warp.converters.common.importers import IMPORTERS
-from beam_warp.converters.common.options import Activation, MaterialActivation, Profile
+from beam_warp.converters.common.options import Activation, MaterialActivation, Profile, ReadOptions
 from beam_warp.converters.delivery.writer import delivered
 from beam_warp.converters.formats import FORMATS, format_of
 from beam_warp.converters.frame_files import written_axes
@@ -115,14 +115,7 @@ def _require_apart(source: Path, output: Path, frame_count: int) -> None:
 
 
 def _read(command: ConvertCommand) -> GaussianSequence:
-    return converters.read(
-        command.input,
-        source_axes=command.source_axes,
-        meters_per_unit=command.meters_per_unit,
-        material_activation=command.material_activation,
-        activation=command.activation,
-        drop_invalid=command.drop_invalid,
-    )
+    return converters.read(command.input, **vars(options_of(command, ReadOptions)))
 
 
 def _write(command: ConvertCommand, sequence: GaussianSequence, path: Path) -> list[Path]:
