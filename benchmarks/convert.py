@@ -29,10 +29,10 @@ from typing import Any
 
 import npm_packages
 import numpy as np
-import parts
 import record
 import warp as wp
 from convert_looks import Looks, difference, looks_of_cloud, looks_of_ply
+from parts import measure, say
 from timing import spread
 from write_lcc import write_lcc, write_lcc2
 
@@ -257,7 +257,7 @@ def speed(bench: Bench) -> Iterator[Row]:
     for count, source, ending in conversions(bench):
         row = {"gaussians": count, "from": suffix_of(source.name), "to": ending, **timed(bench, source, ending)}
         rows.append({"name": f"{row['from'][1:]} to {ending[1:]}", **row})
-        parts.say(f"{rows[-1]['name']}: {row['ours']['seconds']['median']:.2f} s")
+        say(f"{rows[-1]['name']}: {row['ours']['seconds']['median']:.2f} s")
         yield {"rows": rows}
 
 
@@ -452,7 +452,7 @@ def main() -> int:
             "formats": formats(bench),
         }
         keep = functools.partial(_keep, args, head)
-        found = parts.measure(PARTS, bench, only=args.parts, keep=keep)
+        found = measure(PARTS, bench, only=args.parts, keep=keep)
     return 1 if found["failed"] else 0
 
 

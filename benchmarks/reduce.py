@@ -1,8 +1,13 @@
 """Reduced assets under lights and cameras that no search saw: `beam reduce` beside its rivals at the same numbers.
 
-    python benchmarks/reduce.py [--quick] [--device cuda] [--parts sizes] --out result.json
+    python benchmarks/reduce.py [--quick] [--device cuda] [--parts sizes] [--made FOLDER] --out result.json
 
-Every rival keeps or makes the same number of Gaussians, and is measured as it is and after the refit of `beam reduce`:
+- ``sizes``: every rival keeps or makes the same number of Gaussians, and is measured as it is and after the refit of
+  `beam reduce`: against the original under lights and cameras drawn at random, and, where a capture has true images,
+  by what `beam evaluate` says of it less what it says of the original.
+- ``certified``: whole calls of `beam reduce`: seconds, and in how many of 200 fresh draws the stated bound holds.
+
+Rivals:
 
 - opacity x area, the Gaussians that show most by themselves;
 - PUP-style, those with the largest log-determinant of the Hessian of captured images by place and size (Hanson et
@@ -10,8 +15,9 @@ Every rival keeps or makes the same number of Gaussians, and is measured as it i
 - uniform random;
 - splat-transform --decimate-adaptive, of npm; its Gaussians take the mean materials of the originals nearest to each.
 
-Assets are the demo's figure, and Gaussians on the true meshes of captures in $BEAM_DATA whose colours, solved from
-their images, stand for base colours. Defaults were chosen on the figure alone.
+Assets of captures in $BEAM_DATA are read from ``--made``: what `beam run CAPTURE --gaussians 140000` makes of their
+first frames, as NAME.usdc. Where it is not given, they are Gaussians on the true meshes whose colours, solved from
+images, stand for base colours. What splat-transform makes is kept beside the assets, for machines without Node.js.
 """
 
 from __future__ import annotations
@@ -23,7 +29,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +48,14 @@ from beam_warp.converters import read, write
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
+from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.relit import RelitComparison, loss_of
+from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reduction.job import ReduceOptions, Reducer
+from beam_warp.reduction.job import ReduceOptions, Reducer, reduce_asset
 from beam_warp.reduction.moments import Clusters, changed, shown_area
 from beam_warp.reduction.refit import refit
 from beam_warp.study.true_surface import SHARP, surface_of_capture
@@ -58,7 +66,10 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
 Row = dict[str, Any]
-Keep = Callable[[Reducer, GaussianCloud, int], GaussianCloud]
+Keep = Callable[[Reducer, GaussianCloud, int, Path | None], GaussianCloud]
+
+FRESH, FRESH_PAIRS = 77, 200
+"""Seed and number of draws that no search and no certificate saw."""
 
 PROBES = 2
 """Random probes of each view's Jacobian."""
@@ -75,6 +86,7 @@ class Bench:
     tests: int
     options: ReduceOptions
     assets: tuple[str, ...]
+    made: Path | None
     device: Any
 
 
@@ -83,7 +95,9 @@ def asset(name: str, bench: Bench) -> GaussianSequence:
     if name == "figure":
         ((_, cloud),) = take(build_figure(), bench.count, 1)
         return GaussianSequence.from_clouds([cloud], metadata=RasterOptions(antialiased=True).as_metadata())
-    capture = Capture.read(Path(os.environ.get("BEAM_DATA", "../shared/data")) / "captures" / name)
+    if bench.made is not None:
+        return read(bench.made / f"{name}.usdc")
+    capture = capture_of(name)
     colored, _ = surface_of_capture(capture, 0, bench.count, options=SHARP, device=str(bench.device))
     assert colored.radiance is not None
     scene = Scene.from_gaussians(colored, str(bench.device))
@@ -98,28 +112,43 @@ def asset(name: str, bench: Bench) -> GaussianSequence:
     return GaussianSequence.from_clouds([cloud], metadata=SHARP.as_metadata())
 
 
+def capture_of(name: str) -> Capture:
+    """Return a capture by its name."""
+    return Capture.read(Path(os.environ.get("BEAM_DATA", "../shared/data")) / "captures" / name)
+
+
+def against_truth(name: str, sequence: GaussianSequence, bench: Bench) -> float | None:
+    """Return the mean PSNR of relit images against a capture's true ones [dB]; None without."""
+    if name not in CAPTURES or bench.made is None:
+        return None
+    capture = capture_of(name)
+    frame = min(record.frame for record in capture.select(split="test") if record.truth_path is not None)
+    options = EvaluateOptions(frames=(frame,), device=str(bench.device))
+    return score_materials(sequence, capture, options).as_dict()["mean"]["relit_mean"]["deferred"]["psnr"]
+
+
 def kept(score: NDArray[np.floating], cloud: GaussianCloud, count: int) -> GaussianCloud:
     """Return the Gaussians of the highest scores."""
     return cloud.select(np.sort(np.argsort(-np.asarray(score), kind="stable")[:count]))
 
 
-def ours(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
+def ours(reducer: Reducer, cloud: GaussianCloud, count: int, place: Path | None) -> GaussianCloud:
     """Return what `beam reduce` merges, without its refit."""
     return Clusters(cloud, reducer._order.labels(count), reducer.sensitivity.visible).cloud(cloud)
 
 
-def by_area(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
+def by_area(reducer: Reducer, cloud: GaussianCloud, count: int, place: Path | None) -> GaussianCloud:
     """Return the Gaussians of the largest opacity times area, ties broken at random."""
     jitter = 1.0 + 1e-6 * np.random.default_rng(1).random(len(cloud))
     return kept(cloud.opacities * shown_area(cloud.scales) * jitter, cloud, count)
 
 
-def at_random(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
+def at_random(reducer: Reducer, cloud: GaussianCloud, count: int, place: Path | None) -> GaussianCloud:
     """Return Gaussians drawn evenly."""
     return kept(np.random.default_rng(0).random(len(cloud)), cloud, count)
 
 
-def pup(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
+def pup(reducer: Reducer, cloud: GaussianCloud, count: int, place: Path | None) -> GaussianCloud:
     """Return the Gaussians of the largest log-determinant of J^T J by place and size, in images of captured light."""
     assert cloud.base_color is not None
     assert cloud.ambient_occlusion is not None
@@ -139,19 +168,21 @@ def pup(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
     return kept(np.linalg.slogdet(hessian + 1e-12 * np.eye(6))[1], cloud, count)
 
 
-def decimated(reducer: Reducer, cloud: GaussianCloud, count: int) -> GaussianCloud:
-    """Return what splat-transform decimates."""
-    assert cloud.base_color is not None
-    colored = cloud.with_arrays(
-        radiance=((cloud.base_color[:, None] - 0.5) / SH_C0).astype(np.float32), radiance_color_space=LINEAR_REC709
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "in.ply", Path(folder) / "out.ply"
+def decimated(reducer: Reducer, cloud: GaussianCloud, count: int, place: Path | None) -> GaussianCloud:
+    """Return what splat-transform decimates, or what it made of the same before."""
+    if place is None:
+        with tempfile.TemporaryDirectory() as folder:
+            return decimated(reducer, cloud, count, Path(folder) / "out.ply")
+    if not place.is_file():
+        assert cloud.base_color is not None
+        radiance = ((cloud.base_color[:, None] - 0.5) / SH_C0).astype(np.float32)
+        colored = cloud.with_arrays(radiance=radiance, radiance_color_space=LINEAR_REC709)
+        source = place.with_suffix(".in.ply")
         write(GaussianSequence.from_clouds([colored]), source)
         program = [*npm_packages.splat_transform(), "-q", "-g", "cpu"]
-        command = [*program, str(source), "--decimate-adaptive", str(count), str(target)]
+        command = [*program, str(source), "--decimate-adaptive", str(count), str(place)]
         subprocess.run(command, check=True, capture_output=True, timeout=600)
-        found = change_axes(read(target)[0], "rfu")
+    found = change_axes(read(place)[0], "rfu")
     near = cKDTree(found.positions).query(cloud.positions)[1]
     total = np.maximum(np.bincount(near, minlength=len(found)), 1)[:, None]
     nearest = cKDTree(cloud.positions).query(found.positions)[1]
@@ -185,21 +216,37 @@ def sizes(bench: Bench) -> Iterator[Row]:
         measured = time.perf_counter() - started
         comparison = RelitComparison(original, reducer.trials, raster=reducer.raster, device=bench.device)
         draws = reducer.trials.draw("certificate", range(bench.tests), [0])
+        truth = against_truth(name, original, bench)
+
+        def judge(cloud: GaussianCloud, name: str = name, judged: Any = (comparison, draws, original, truth)) -> Row:
+            comparison, draws, original, truth = judged
+            one = replace(original, read_frame=lambda _: cloud)
+            psnr = comparison.errors(one, draws, keep=True).psnr
+            loss = loss_of(psnr) if truth is None else loss_of(psnr, truth)
+            said: Row = {"psnr": psnr.mean(), "loss": loss.mean(), "loss_95": np.quantile(loss, 0.95)}
+            return said if truth is None else said | {"truth_loss": truth - (against_truth(name, one, bench) or 0.0)}
+
         cloud = change_axes(original[0], "rfu")
         for share in bench.shares:
             for contender, keep in CONTENDERS.items():
-                row: Row = {"name": f"{name} {share:g} {contender}", "asset": name, "share": share}
+                row: Row = {"name": f"{name} {share:g} {contender}", "asset": name, "share": share, "truth": truth}
                 row |= {"contender": contender, "original": len(cloud), "sensitivity_seconds": measured}
+                place = None if bench.made is None else bench.made / f"{name}_{share:g}.ply"
+                count = round(share * len(cloud))
                 try:
-                    rows.append(row | contend(keep, reducer, cloud, round(share * len(cloud)), comparison, draws))
+                    rows.append(row | contend(functools.partial(keep, place=place), reducer, cloud, count, judge))
                 except (npm_packages.MissingPackagesError, subprocess.SubprocessError) as error:
                     rows.append(row | {"absent": str(error)})
-                say(f"{rows[-1]['name']}: {rows[-1].get('refit', {}).get('psnr')}")
+                say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
                 yield {"rows": rows, "height": bench.options.height, "tests": bench.tests}
 
 
 def contend(
-    keep: Keep, reducer: Reducer, cloud: GaussianCloud, count: int, comparison: RelitComparison, draws: Any
+    keep: Callable[[Reducer, GaussianCloud, int], GaussianCloud],
+    reducer: Reducer,
+    cloud: GaussianCloud,
+    count: int,
+    judge: Callable[[GaussianCloud], Row],
 ) -> Row:
     """Measure one contender, as it is and refitted."""
     started = time.perf_counter()
@@ -210,18 +257,40 @@ def contend(
     fitted = changed(bare, turn, refit({0: (bare, turn)}, reducer.sensitivity, **how))
     ended = time.perf_counter()
     found = {"gaussians": len(bare), "chosen_seconds": chosen - started, "refit_seconds": ended - chosen}
-    for name, each in (("bare", bare), ("refit", fitted)):
-        psnr = comparison.errors(GaussianSequence.from_clouds([each]), draws, keep=True).psnr
-        loss = loss_of(psnr)
-        found[name] = {"psnr": psnr.mean(), "loss": loss.mean(), "loss_95": np.quantile(loss, 0.95)}
-    return found
+    return found | {"bare": judge(bare), "refit": judge(fitted)}
 
 
-PARTS = {"sizes": sizes}
+def certified(bench: Bench) -> Iterator[Row]:
+    """Run whole reductions, and try what they state on fresh draws."""
+    rows: list[Row] = []
+    lights = list(demo_environments().values())
+    for name in bench.assets:
+        original = asset(name, bench)
+        for share in bench.shares:
+            target = {"gaussians": round(share * len(original[0]))}
+            rows.append({"name": f"{name} {share:g}", "asset": name, "share": share})
+            with tempfile.TemporaryDirectory() as folder:
+                started = time.perf_counter()
+                out = Path(folder) / "small.usdc"
+                found = reduce_asset(original, lights, replace(bench.options, **target), out)
+                rows[-1] |= {"seconds": time.perf_counter() - started, "gaussians": found.count}
+                reduced = read(out)
+                trials = RelitTrials(lights, height=bench.options.height, seed=FRESH, device=bench.device)
+                comparison = RelitComparison(original, trials, device=bench.device)
+                errors = comparison.errors(reduced, trials.draw("certificate", range(FRESH_PAIRS), [0])).values("loss")
+            stated = found.certificate
+            within = float(np.mean(errors <= stated.bound))
+            rows[-1] |= {"bound": stated.bound, "share_stated": stated.share, "within": within, "pairs": FRESH_PAIRS}
+            say(str(rows[-1]))
+            yield {"rows": rows}
+
+
+PARTS = {"sizes": sizes, "certified": certified}
 
 
 def main() -> int:
     parser = record.parser(__doc__, device="cpu", quick="the figure, small, a few steps", parts=PARTS)
+    parser.add_argument("--made", type=Path, metavar="FOLDER", help="assets of captures, and what rivals made of them")
     parser.add_argument("--assets", nargs="+", default=["figure", *CAPTURES], metavar="NAME")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
@@ -230,7 +299,7 @@ def main() -> int:
         arguments.assets, count, height, tests, views, steps = ["figure"], 800, 48, 4, 4, 4
     options = ReduceOptions(gaussians=1, height=height, views=views, steps=steps, device=device)
     shares = (0.2,) if arguments.quick else (0.2, 0.1)
-    bench = Bench(count, shares, tests, options, tuple(arguments.assets), device)
+    bench = Bench(count, shares, tests, options, tuple(arguments.assets), arguments.made, device)
     keep = functools.partial(record.write_result, arguments, device)
     result = measure(PARTS, bench, only=arguments.parts, keep=keep)
     keep(result)

@@ -32,7 +32,7 @@ common
 light raster
 mesh
 trace
-render materials reconstruction
+render materials reconstruction reduction
 """
 """Families of kernels from the bottom up."""
 

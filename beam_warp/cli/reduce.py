@@ -38,13 +38,16 @@ class Reduce:
     ]
     out: Annotated[Path, arg(metavar="FILE", help="Asset to write: .usda, .usdc, or .b4d for players.")]
     max_loss: Annotated[
-        float | None, arg(metavar="DB", help="Most loss of a good asset's PSNR against the truth, in 19 of 20 draws.")
+        float | None, arg(metavar="DB", help="Most loss of PSNR against the truth, in 19 of 20 draws.")
     ] = None
     max_flip: Annotated[float | None, arg(metavar="X", help="Most FLIP against the original, in 19 of 20 draws.")] = (
         None
     )
     size: Annotated[str | None, arg(metavar="BYTES", help="Most bytes of the file, such as 20MB.")] = None
     gaussians: Annotated[int | None, arg(metavar="N", help="Number of Gaussians.")] = None
+    asset_psnr: Annotated[
+        float, arg(metavar="DB", help="What the asset's relit images have against the truth, as beam evaluate says.")
+    ] = 35.0
     environment: Annotated[
         tuple[Path, ...], arg(metavar="FILE ...", help="One to four lights to measure under; else the demo's three.")
     ] = ()
@@ -73,6 +76,7 @@ def reduce(args: Reduce) -> int:
         max_flip=args.max_flip,
         size=None if args.size is None else bytes_of(args.size),
         gaussians=args.gaussians,
+        asset_psnr=args.asset_psnr,
         height=args.height,
         pairs=args.pairs,
         confidence=args.confidence,

@@ -20,7 +20,7 @@ from scipy import stats
 from beam_warp.digests import array_digest
 from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.evaluate.physical_rules import CERTIFIED, Measured
-from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison
+from beam_warp.evaluate.relit import RelitComparison
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
@@ -52,7 +52,7 @@ class Certificate:
         first: Number of the first draw.
         mean: Mean error, with the ends of its interval of the same confidence by Student's t.
         psnr: Mean PSNR against the original [dB].
-        asset_psnr: PSNR against the truth that ``loss`` takes for granted [dB].
+        asset_psnr: The original's PSNR against the truth, which ``loss`` is counted from [dB]; nobody measures it again.
         distribution: Lights by digest, image height, seed.
         original: Digest of the original.
         asset: Digest of the asset.
@@ -74,10 +74,11 @@ class Certificate:
 
     def __str__(self) -> str:
         """Return what is certified, in a sentence."""
-        unit = " dB" if self.measure == "loss" else ""
+        is_loss = self.measure == "loss"
+        unit, of = (" dB", f" of an asset of {self.asset_psnr:.1f} dB") if is_loss else ("", "")
         low, high = (f"{end:.3g}" for end in self.mean[1:])
         return (
-            f"{self.measure} at most {self.bound:.3g}{unit} for at least {self.share:.1%} of lights, cameras and "
+            f"{self.measure} at most {self.bound:.3g}{unit}{of} for at least {self.share:.1%} of lights, cameras and "
             f"frames, with {self.confidence:.1%} confidence "
             f"({self.within} of {self.pairs} draws; mean {self.mean[0]:.3g}, "
             f"{low} to {high}; {self.psnr:.1f} dB against the original)"
@@ -153,7 +154,7 @@ def certify(
         first=first,
         mean=(float(errors.mean()), float(spread[0]), float(spread[1])),
         psnr=float(found.psnr.mean()),
-        asset_psnr=ASSET_PSNR,
+        asset_psnr=comparison.asset_psnr,
         distribution=comparison.trials.describe(),
         original=asset_digest(comparison.original),
         asset=asset_digest(asset),
@@ -209,7 +210,8 @@ def measured_again(
     ):
         if there != here:
             raise InvalidOptionError(f"{name} must be the certificate's, {there}, got {here}. Name the same files.")
-    comparison = RelitComparison(original, trials, measure=stated.measure, device=device)
+    how = {"measure": stated.measure, "asset_psnr": stated.asset_psnr, "device": device}
+    comparison = RelitComparison(original, trials, **how)
     again = certify(
         comparison, asset, measure=stated.measure, bound=stated.bound * ROUNDING, pairs=stated.pairs, first=stated.first
     )

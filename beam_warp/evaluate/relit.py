@@ -22,7 +22,7 @@ from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequenc
 from beam_warp.world.shot import RenderedImage
 
 ASSET_PSNR = 35.0
-"""PSNR of a good asset's relit images against the truth [dB]."""
+"""PSNR of an asset's relit images against the truth where nobody measured it: that of a good one [dB]."""
 
 
 def compared_options(height: int) -> DeferredOptions:
@@ -31,13 +31,14 @@ def compared_options(height: int) -> DeferredOptions:
     return DeferredOptions(environment_shadows=0, bounces=0, light_map_size=size, layers=())
 
 
-def loss_of(psnr: ArrayLike) -> NDArray[np.float64]:
-    """Return what an asset of `ASSET_PSNR` loses against the truth by errors that are independent of its own [dB].
+def loss_of(psnr: ArrayLike, asset_psnr: float = ASSET_PSNR) -> NDArray[np.float64]:
+    """Return what an asset's relit images lose against the truth by errors that are independent of its own [dB].
 
     Args:
         psnr: Of its images against those before the errors [dB].
+        asset_psnr: Of its images before the errors against the truth [dB].
     """
-    return 10.0 * np.log10(1.0 + 10.0 ** ((ASSET_PSNR - np.asarray(psnr)) / 10.0))
+    return 10.0 * np.log10(1.0 + 10.0 ** ((asset_psnr - np.asarray(psnr)) / 10.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +48,17 @@ class RelitErrors:
     Attributes:
         psnr: PSNR of the images against those of the original, in the subject's box on black, as sRGB [dB], ``(T,)``.
         flip: Mean FLIP there, ``(T,)``; None unless it was asked for.
+        asset_psnr: See `loss_of`.
     """
 
     psnr: NDArray[np.float64]
     flip: NDArray[np.float64] | None
+    asset_psnr: float = ASSET_PSNR
 
     def values(self, measure: str) -> NDArray[np.float64]:
         """Return errors by the name of their measure: ``loss`` [dB], see `loss_of`, or ``flip``."""
         if measure == "loss":
-            return loss_of(self.psnr)
+            return loss_of(self.psnr, self.asset_psnr)
         assert self.flip is not None
         return self.flip
 
@@ -70,6 +73,7 @@ class RelitComparison:
         *,
         raster: RasterOptions | None = None,
         measure: str = "loss",
+        asset_psnr: float = ASSET_PSNR,
         device: Any = None,
     ) -> None:
         """Choose the original, and how images are drawn and compared.
@@ -79,12 +83,13 @@ class RelitComparison:
             trials: The distribution.
             raster: How splats are drawn; as the original states without.
             measure: ``flip`` if that is to be measured besides the loss.
+            asset_psnr: See `loss_of`.
             device: Warp device; None takes the first CUDA device, or the CPU where there is none.
 
         Raises:
             MissingPackageError: FLIP cannot be measured here.
         """
-        self.original, self.trials = original, trials
+        self.original, self.trials, self.asset_psnr = original, trials, asset_psnr
         self._flip = require_flip() if measure == "flip" else None
         options = raster or RasterOptions.from_metadata(original.metadata)
         shading = compared_options(trials.height)
@@ -107,7 +112,7 @@ class RelitComparison:
             for place, trial in enumerate(trials):
                 if trial.frame == frame:
                     found[place], flip[place] = self._compared(trial, *pair, keep)
-        return RelitErrors(found, None if self._flip is None else flip)
+        return RelitErrors(found, None if self._flip is None else flip, self.asset_psnr)
 
     def _compared(self, trial: Trial, original: GaussianCloud, cloud: GaussianCloud, keep: bool) -> tuple[float, float]:
         truth = self._kept.get(trial)

@@ -10,11 +10,14 @@ exposed so that the white diffuser that gets most light has the radiance `BRIGHT
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from beam_warp.checks import require_count
 from beam_warp.digests import array_digest
@@ -102,6 +105,7 @@ class RelitTrials:
         self.seed = require_count("seed", seed, 0, 2**32 - 1)
         exposed = [PreparedEnvironment(_exposed(environment), device) for environment in environments]
         self.prepared = (*exposed, *(each.scaled(DIMMED) for each in exposed))
+        self._outlined: tuple[GaussianCloud | None, NDArray[np.float64]] = (None, np.zeros((0, 3)))
 
     def describe(self) -> dict[str, object]:
         """Return the distribution as JSON-able facts; lights by their digests."""
@@ -134,9 +138,17 @@ class RelitTrials:
 
     def camera(self, trial: Trial, cloud: GaussianCloud) -> Camera:
         """Return the camera of a trial; all of a cloud's bulk is in its image."""
-        points = bulk(cloud.positions, cloud.opacities)
-        side = self.height
+        side, points = self.height, self._outline(cloud)
         return Camera.frame_points(points, azimuth=trial.azimuth, elevation=trial.elevation, width=side, height=side)
+
+    def _outline(self, cloud: GaussianCloud) -> NDArray[np.float64]:
+        """Return corners of the hull of a cloud's bulk, ``(M, 3)``; those of the last cloud are kept."""
+        if cloud is not self._outlined[0]:
+            points = bulk(cloud.positions, cloud.opacities)
+            with contextlib.suppress(QhullError):  # points on a line or a plane have no hull
+                points = points[ConvexHull(points).vertices]
+            self._outlined = cloud, points
+        return self._outlined[1]
 
     def lights(self, trial: Trial, cloud: GaussianCloud) -> tuple[EnvironmentMap, tuple[Light, ...]]:
         """Return the environment of a trial, not yet turned, and the lamp beside it."""
@@ -147,7 +159,7 @@ class RelitTrials:
         x, y, z = trial.toward
         if trial.lamp == "sun":
             return dim, (DirectionalLight(direction=(-x, -y, -z), irradiance=(power, power, power)),)
-        points = bulk(cloud.positions, cloud.opacities)
+        points = self._outline(cloud)
         center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius = max(float(np.linalg.norm(points - center, axis=1).max()), 1e-3)
         away = trial.distance * radius

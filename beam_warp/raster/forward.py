@@ -51,8 +51,8 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
 
 
 def gather_channels(buffers: FrameBuffers) -> None:
-    """Write every splat's row of channels."""
-    for i, rows in enumerate(buffers.rows):
+    """Write every splat's row of channels; where there are none, rows stay 0."""
+    for i, rows in enumerate(buffers.rows if buffers.channels.count else ()):
         launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.matrix, buffers.device)
 
 

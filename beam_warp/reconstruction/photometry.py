@@ -31,10 +31,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtri
 
 from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.capture.views import CapturedView
@@ -325,6 +325,6 @@ def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
 def _part_beyond_chance(found: NDArray[np.float64], error: float, freedom: int) -> float:
     """Return the part of what was found that an error does not explain: 0 unless an F test says that it is not all."""
     signal = float(np.mean(np.square(found)))
-    if not signal > error**2 * stats.f.isf(CHANCE, freedom, freedom):
+    if not signal > error**2 / fdtri(freedom, freedom, CHANCE):  # F's upper quantile, of equal freedoms
         return 0.0
     return 1.0 - error**2 / signal

@@ -16,7 +16,7 @@ from beam_warp.converters.formats import format_of
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.evaluate.certificate import MOST_PAIRS, Certificate, certify
-from beam_warp.evaluate.relit import RelitComparison, require_flip, world
+from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, require_flip, world
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
@@ -70,6 +70,7 @@ class ReduceOptions:
         max_flip: Most mean FLIP against the original, in (0, 1].
         size: Most bytes of what is written.
         gaussians: Number of Gaussians.
+        asset_psnr: PSNR of the asset's relit images against the truth [dB], which ``max_loss`` is counted from.
         height: Side of the images that are compared [pixel]: the size at which the asset will be seen.
         pairs: Draws of a light, a camera and a frame that the certificate is made on.
         confidence: Of the certificate, in (0, 1).
@@ -87,6 +88,7 @@ class ReduceOptions:
     max_flip: float | None = None
     size: int | None = None
     gaussians: int | None = None
+    asset_psnr: float = ASSET_PSNR
     height: int = 256
     pairs: int = 200
     confidence: float = 0.95
@@ -109,6 +111,7 @@ class ReduceOptions:
         for name in ("size", "gaussians"):
             if getattr(self, name) is not None:
                 require_count(name, getattr(self, name), 1, 2**40)
+        require_number("asset_psnr", self.asset_psnr, 5.0, 100.0)
         require_count("pairs", self.pairs, 2, MOST_PAIRS)
         require_number("confidence", self.confidence, 0.5, 0.9999)
         require_count("views", self.views, 1, 1024)
@@ -197,7 +200,7 @@ class Reducer:
         lights = self.trials.draw("search", range(options.views, 3 * options.views), self._frames)
         how = {"raster": self.raster, "device": self._device, "progress": progress}
         self.sensitivity: Sensitivity = measure_sensitivity(original, self.trials, views, lights, **how)
-        self._order = MergeOrder(clouds, self.sensitivity)
+        self._order = MergeOrder(clouds, self.sensitivity, self._device)
 
     def __len__(self) -> int:
         """Return the number of Gaussians of the original."""
@@ -262,6 +265,7 @@ def reduce_asset(
         require_flip()
     reducer = Reducer(original, environments, options, progress)
     how = {"raster": reducer.raster, "measure": options.measure, "device": options.device}
+    how["asset_psnr"] = options.asset_psnr
     comparison = RelitComparison(original, reducer.trials, **how)
     with tempfile.TemporaryDirectory(prefix="beam_reduce_") as folder:
         search = _Search(reducer, comparison, Path(folder) / f"stored{out.suffix}")

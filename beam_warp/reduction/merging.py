@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from beam_warp.reduction.sensitivity import MATERIALS, Sensitivity, material_rows
+from beam_warp.device.arrays import resolve_device
+from beam_warp.kernels.reduction.pair_costs import Clusters as PairedClusters
+from beam_warp.kernels.reduction.pair_costs import launch_pair_costs
+from beam_warp.reduction.sensitivity import Sensitivity, material_rows
 from beam_warp.world.gaussians import GaussianCloud
 
 NEIGHBORS = 8
@@ -24,8 +29,6 @@ FLOOR = 5e-3
 
 MERGED_AT_ONCE = 0.5
 """Share of the pairs that choose each other, cheapest first, that merge before costs are found anew."""
-
-NORMAL = slice(MATERIALS - 3, MATERIALS)
 
 FloatArray = NDArray[np.float64]
 
@@ -41,17 +44,18 @@ class MergeOrder:
     Source: Ward 1963; Murtagh 1983 (mutual nearest neighbours).
     """
 
-    def __init__(self, clouds: Sequence[GaussianCloud], found: Sensitivity) -> None:
+    def __init__(self, clouds: Sequence[GaussianCloud], found: Sensitivity, device: Any = None) -> None:
         """Begin with every Gaussian by itself.
 
         Args:
             clouds: Some frames of a constant topology, in the world's axes.
             found: What their images depend on.
+            device: Warp device on which costs are found.
         """
         count = len(clouds[0])
-        self._pixel, self._count = found.pixel, count
-        self._weight = found.visible.astype(np.float64) + 1e-6 * (1.0 + float(found.visible.mean()))
-        self._edges = found.edges + FLOOR * self._weight
+        self._pixel, self._count, self._device = found.pixel, count, resolve_device(device)
+        self._weights = found.visible.astype(np.float64) + 1e-6 * (1.0 + float(found.visible.mean()))
+        self._edges = found.edges + FLOOR * self._weights
         self._forms = found.materials.copy()
         self._materials = np.stack([material_rows(cloud) for cloud in clouds]).astype(np.float64)
         self._places = np.stack([cloud.positions for cloud in clouds]).astype(np.float64)
@@ -74,21 +78,21 @@ class MergeOrder:
             np.minimum.at(best, side, costs)
         mutual = np.flatnonzero((costs <= best[pairs[:, 0]]) & (costs <= best[pairs[:, 1]]))
         mutual = mutual[np.argsort(costs[mutual], kind="stable")]
-        chosen, taken = [], np.zeros(len(self._heads), bool)
-        for index in mutual[: max(1, int(np.ceil(MERGED_AT_ONCE * len(mutual))))]:
-            if not taken[pairs[index]].any():  # pairs of equal cost may share a cluster
-                taken[pairs[index]] = True
-                chosen.append(index)
-        kept, gone = pairs[chosen].T
-        self._merges = np.concatenate([self._merges, self._heads[pairs[chosen]]])
-        share = self._weight[gone] / (self._weight[kept] + self._weight[gone])
+        some = pairs[mutual[: max(1, int(np.ceil(MERGED_AT_ONCE * len(mutual))))]]
+        first = np.full(len(self._heads), len(some))
+        for side in some.T:
+            np.minimum.at(first, side, np.arange(len(some)))
+        chosen = some[(first[some] == np.arange(len(some))[:, None]).all(axis=1)]  # equal costs may share a cluster
+        kept, gone = chosen.T
+        self._merges = np.concatenate([self._merges, self._heads[chosen]])
+        share = self._weights[gone] / (self._weights[kept] + self._weights[gone])
         for means in (self._materials, self._places):
             means[:, kept] += share[:, None] * (means[:, gone] - means[:, kept])
-        for sums in (self._weight, self._edges, self._forms):
+        for sums in (self._weights, self._edges, self._forms):
             sums[kept] += sums[gone]
         left = np.ones(len(self._heads), bool)
         left[gone] = False
-        self._heads, self._weight = self._heads[left], self._weight[left]
+        self._heads, self._weights = self._heads[left], self._weights[left]
         self._edges, self._forms = self._edges[left], self._forms[left]
         self._materials, self._places = self._materials[:, left], self._places[:, left]
 
@@ -97,19 +101,14 @@ class MergeOrder:
         count = len(self._heads)
         near = cKDTree(self._places[0]).query(self._places[0], k=min(NEIGHBORS + 1, count), workers=-1)[1]
         one, two = np.repeat(np.arange(count), near.shape[1]), near.reshape(-1)
-        pairs = np.unique(np.sort(np.stack([one, two], axis=1)[one != two], axis=1), axis=0)
-        one, two = pairs.T
-        total = self._weight[one] + self._weight[two]
-        share = self._weight[one] * self._weight[two] / total
-        form = (self._forms[one] + self._forms[two]) / total[:, None, None]
-        slope = (self._edges[one] + self._edges[two]) / total
-        costs = np.zeros(len(pairs))
-        for materials, places in zip(self._materials, self._places, strict=True):
-            away, apart = materials[one] - materials[two], places[one] - places[two]
-            normal = materials[one, NORMAL] + materials[two, NORMAL]
-            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-            across = np.einsum("pk,pk->p", apart, normal) ** 2
-            along = np.square(apart).sum(axis=1) - across
-            shift = (across + SPREAD * along) / self._pixel**2
-            costs += np.einsum("pi,pij,pj->p", away, form, away, optimize=True) + slope * shift
-        return pairs, costs * share
+        low, high = np.minimum(one, two), np.maximum(one, two)
+        keys = np.unique((low * count + high)[low < high])
+        pairs = np.stack([keys // count, keys % count], axis=1)
+        clusters, device = PairedClusters(), self._device
+        for name in ("weights", "edges", "forms", "materials"):
+            setattr(clusters, name, wp.array(getattr(self, f"_{name}"), dtype=float, device=device))
+        clusters.places = wp.array(self._places, dtype=wp.vec3, device=device)
+        costs = wp.empty(len(pairs), dtype=float, device=device)
+        at = wp.array(pairs.astype(np.int32), dtype=wp.vec2i, device=device)
+        launch_pair_costs(len(pairs), at, clusters, self._pixel, SPREAD, costs, device)
+        return pairs, costs.numpy().astype(np.float64)

@@ -7,24 +7,26 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from beam_warp.device.arrays import upload
 from beam_warp.jobs.listeners import StageProgress, no_progress
+from beam_warp.kernels.reduction.changes import launch_change, launch_change_adjoint
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.rasterizer import Rasterizer
-from beam_warp.raster.records import GaussianGradients, RasterOptions
+from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reduction.moments import Changes, changed
-from beam_warp.reduction.sensitivity import COLUMNS, MATERIALS, Sensitivity, material_rows, pixel_sums
+from beam_warp.reduction.moments import Changes, logit_of
+from beam_warp.reduction.sensitivity import MATERIALS, Sensitivity, material_rows
 from beam_warp.world.gaussians import GaussianCloud
 
 RATES = {"shift": 0.05, "turn": 0.01, "stretch": 0.02, "logit": 0.05, "materials": 0.005}
 """Learning rates at first, of shifts in median scales; they fall to nothing along a quarter of a cosine."""
 
-WIDTHS = {"shift": 3, "turn": 4, "stretch": 3, "logit": 1, "materials": MATERIALS}
+RATED_EVERY = 10
+"""Steps between changes of the rates."""
 
-FloatArray = NDArray[np.float64]
+MOVED = ("shift", "turn", "stretch", "logit", "materials")
 
 
 def refit(
@@ -46,65 +48,69 @@ def refit(
         device: Warp device.
         progress: Called with (stage, done, total).
     """
-    count = len(next(iter(frames.values()))[0])
-    values = {name: wp.zeros((count, width), dtype=float, device=device) for name, width in WIDTHS.items()}
-    values["turn"].assign(np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1)))
-    slopes = {name: wp.zeros_like(array) for name, array in values.items()}
     some, _ = next(iter(frames.values()))
+    work = _Refit(frames, found, raster, device)
     rates = RATES | {"shift": RATES["shift"] * float(np.median(np.sort(some.scales, axis=1)[:, 1]))}
-    adam = Adam({name: Parameters(values[name], slopes[name], rates[name]) for name in WIDTHS})
-    cameras = [view.camera for view in found.views]
-    drawer = Rasterizer(count, cameras[:1], value_count=MATERIALS, options=raster, device=device)
-    prepared = [drawer.prepare_cameras([camera]) for camera in cameras]
+    pairs = zip(MOVED, work.changes, work.slopes, strict=True)
+    adam = Adam({name: Parameters(values, slopes, rates[name]) for name, values, slopes in pairs})
     for step in range(steps):
-        progress("refit", step, steps)
-        for name, rate in rates.items():
-            adam.set_learning_rate(name, rate * np.cos(0.5 * np.pi * step / steps))
-        view = found.views[step % len(cameras)]
-        drawer.set_cameras(prepared[step % len(cameras)])
-        cloud, turn = frames[view.frame]
-        now = changed(cloud, turn, _changes(values))
-        images = drawer.draw(upload_gaussians(now, device, values=material_rows(now)))
-        _set_adjoints(drawer, view.error(pixel_sums(images))[1])
-        for name, rows in _slopes(now, turn, drawer.backward()).items():
-            slopes[name].assign(rows.astype(np.float32).reshape(count, -1))
+        if step % RATED_EVERY == 0:
+            progress("refit", step, steps)
+            for name, rate in rates.items():
+                adam.set_learning_rate(name, rate * np.cos(0.5 * np.pi * step / steps))
+        work.differentiate(step % len(found.views))
         adam.step()
-    return _changes(values)
+    return work.found()
 
 
-def _changes(values: Mapping[str, wp.array]) -> Changes:
-    """Return the parameters as changes."""
-    rows = {name: array.numpy().astype(np.float64) for name, array in values.items()}
-    return Changes(**(rows | {"logit": rows["logit"][:, 0]}))
+class _Refit:
+    """The numbers that a refit moves, and their derivatives, on the device.
+
+    Attributes:
+        changes: As in `Changes`, in the order of `MOVED`.
+        slopes: Derivatives of the error of one view to them.
+    """
+
+    def __init__(
+        self,
+        frames: Mapping[int, tuple[GaussianCloud, Rotation]],
+        found: Sensitivity,
+        raster: RasterOptions,
+        device: Any,
+    ) -> None:
+        """Bring the frames to the device, unchanged as yet."""
+        self._views, self._device = found.views, device
+        self._merged = {frame: _uploaded(cloud, turn, device) for frame, (cloud, turn) in frames.items()}
+        some = next(iter(self._merged.values()))
+        count = len(some[0])
+        kinds = zip(MOVED, (wp.vec3, wp.quat, wp.vec3, float, float), strict=True)
+        shapes = {name: (count, MATERIALS) if name == "materials" else (count,) for name in MOVED}
+        self.changes = tuple(wp.zeros(shapes[name], dtype=kind, device=device) for name, kind in kinds)
+        self.changes[1].fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+        self.slopes = tuple(wp.zeros_like(array) for array in self.changes)
+        self._gaussians = GaussianArrays(*(wp.empty_like(array) for array in some[:-1]))
+        cameras = [view.camera for view in found.views]
+        self._drawer = Rasterizer(count, cameras[:1], value_count=MATERIALS, options=raster, device=device)
+        self._cameras = [self._drawer.prepare_cameras([camera]) for camera in cameras]
+
+    def differentiate(self, number: int) -> None:
+        """Find the slopes of the error of a view."""
+        view, drawer = self._views[number], self._drawer
+        merged = self._merged[view.frame]
+        drawer.set_cameras(self._cameras[number])
+        launch_change(merged, self.changes, self._gaussians[:5], self._device)
+        view.slopes(drawer.draw(self._gaussians), drawer.adjoints())
+        gradients = drawer.backward()[:5]
+        launch_change_adjoint(merged, self.changes, self._gaussians[:5], gradients, self.slopes, self._device)
+
+    def found(self) -> Changes:
+        """Return the changes on the host."""
+        return Changes(**{n: a.numpy().astype(np.float64) for n, a in zip(MOVED, self.changes, strict=True)})
 
 
-def _set_adjoints(drawer: Rasterizer, slope: NDArray[np.float32]) -> None:
-    """Write an error's derivatives to the sums of pixels where `Rasterizer.backward` reads them."""
-    target = drawer.adjoints()
-    assert slope.shape[1] == COLUMNS
-    target.channels[0].assign(np.ascontiguousarray(slope[:, :MATERIALS]))
-    target.alpha.assign(np.ascontiguousarray(slope[:, MATERIALS]))
-
-
-def _slopes(now: GaussianCloud, turn: Rotation, found: GaussianGradients) -> dict[str, FloatArray]:
-    """Return the derivatives to the changes, from those to the Gaussians as they are drawn."""
-    gradients = {name: getattr(found, name).numpy().astype(np.float64) for name in found._fields if name != "radiance"}
-    back, materials = turn.inv(), gradients["values"][:, :MATERIALS].copy()
-    normals = materials[:, 5:]
-    assert now.normals is not None
-    normals -= (normals * now.normals).sum(axis=1, keepdims=True) * now.normals
-    materials[:, 5:] = back.apply(normals)
-    opacities = now.opacities.astype(np.float64)
-    return {
-        "shift": back.apply(gradients["positions"]),
-        "turn": _hamilton(now.orientations * [-1.0, -1.0, -1.0, 1.0], gradients["orientations"]),
-        "stretch": gradients["scales"] * now.scales,
-        "logit": gradients["opacities"] * opacities * (1.0 - opacities),
-        "materials": materials,
-    }
-
-
-def _hamilton(left: NDArray[np.floating], right: FloatArray) -> FloatArray:
-    """Return the products of quaternions xyzw, ``(N, 4)``."""
-    (a, s), (b, t) = ((rows[:, :3], rows[:, 3:]) for rows in (left, right))
-    return np.concatenate([s * b + t * a + np.cross(a, b), s * t - (a * b).sum(axis=1, keepdims=True)], axis=1)
+def _uploaded(cloud: GaussianCloud, turn: Rotation, device: Any) -> tuple[wp.array, ...]:
+    """Return positions, orientations, scales, logits of opacities, materials, and turns since the reference."""
+    shape = upload_gaussians(cloud, device, values=material_rows(cloud))
+    logits = logit_of(cloud.opacities.astype(np.float64)).astype(np.float32)
+    turns = turn.as_quat().astype(np.float32)
+    return (*shape[:3], upload(logits, float, device), shape.values, upload(turns, wp.quat, device))

@@ -19,9 +19,15 @@ from numpy.typing import NDArray
 from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.relit import world
 from beam_warp.evaluate.trials import RelitTrials, Trial
-from beam_warp.image.color import linear_to_srgb
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.kernels.raster.project import RasterView
+from beam_warp.kernels.reduction.image_forms import (
+    launch_add_edges,
+    launch_add_forms,
+    launch_carry,
+    launch_form_slopes,
+    launch_nudge,
+)
 from beam_warp.kernels.render.deferred_pixels import launch_shade_gaussians
 from beam_warp.light.prepared import PreparedEnvironments
 from beam_warp.raster.layout import ViewLayout
@@ -54,36 +60,39 @@ OTHER_BACKGROUNDS = 0.1
 EMPTY_WEIGHT = 0.5
 """Weight of alpha where nothing should be: encoding for display is steepest in the dark."""
 
-TRIANGLE = np.triu_indices(MATERIALS)
+FORM, CARRIED, PASS = COLUMNS * (COLUMNS + 1) // 2, 48, 16
+"""Numbers of a form as it is stored; those of a pixel that are carried back, and how many of them at a time."""
+
+TRIANGLE = np.tril_indices(MATERIALS)
 
 FloatArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class SeenView:
-    """One view of the original: what a reduced asset is to show, and how errors count.
+    """One view of the original: what a reduced asset is to show, and how errors count; arrays are on the device.
 
     Attributes:
         camera: The camera.
         frame: Number of the frame.
-        target: Sums of every pixel, ``(P, 9)``.
-        covered: Pixels that are not empty, ``(C,)``.
-        matrices: The quadratic form of their errors, ``(C, 9, 9)``.
+        target: Sums of the materials of every pixel, ``(P, 8)``.
+        alpha: Alpha of every pixel, ``(P,)``.
+        places: Each pixel's row in ``forms``, -1 where it is empty, ``(P,)``.
+        forms: The quadratic forms of errors of pixels that are not empty, as in ``kernels/reduction/image_forms.py``.
     """
 
     camera: Camera
     frame: int
-    target: FloatArray
-    covered: NDArray[np.int64]
-    matrices: FloatArray
+    target: wp.array
+    alpha: wp.array
+    places: wp.array
+    forms: wp.array
 
-    def error(self, sums: FloatArray) -> tuple[float, FloatArray]:
-        """Return the error of what another asset shows, ``(P, 9)``, summed over pixels, and its gradient."""
-        away = sums - self.target
-        slope = np.zeros_like(away)
-        slope[:, MATERIALS] = EMPTY_WEIGHT * away[:, MATERIALS]
-        slope[self.covered] = np.einsum("pij,pj->pi", self.matrices, away[self.covered], optimize=True)
-        return float(np.vdot(away, slope)), 2.0 * slope
+    def slopes(self, images: RasterImages, out: RasterImages) -> None:
+        """Write the derivatives of the error of what another asset shows to ``out``."""
+        known = (self.places, self.forms, self.target, self.alpha, EMPTY_WEIGHT)
+        found = (images.channels[0], images.alpha, out.channels[0], out.alpha)
+        launch_form_slopes(len(self.alpha), *known, *found, self.alpha.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +137,7 @@ def measure_sensitivity(
     """
     meter = _Meter(sequence, trials, raster, resolve_device(device))
     count = len(TRIANGLE[0])
-    views, totals, pixels = [], np.zeros((len(sequence[0]), 48), np.float32), []
+    views, totals, pixels = [], np.zeros((len(sequence[0]), CARRIED), np.float32), []
     for number, trial in enumerate(cameras):
         progress("measure sensitivity", number, len(cameras))
         some = [lights[(number * LIGHTS + k) % len(lights)] for k in range(LIGHTS)]
@@ -166,51 +175,56 @@ class _Meter:
             len(self._cloud), [camera], value_count=MATERIALS, options=self._raster, device=self._device
         )
         images = rasterizer.draw(self._gaussians)
-        sums = pixel_sums(images)
-        covered = np.flatnonzero(sums[:, MATERIALS] > LEAST_ALPHA)
-        matrices, edges = np.zeros((len(covered), COLUMNS, COLUMNS), np.float32), np.zeros(len(sums), np.float32)
-        for light in lights:
-            shades = self._shades(camera, images, sums, light)
-            slopes = (shades[1:, covered] - shades[0, covered]) / STEPS[:, None, None]
-            matrices += np.einsum("ipc,jpc->pij", slopes, slopes, optimize=True) / len(lights)
-            along = np.gradient(shades[0].reshape(camera.height, camera.width, 3), axis=(0, 1))
-            edges += 0.5 * sum(np.square(each).sum(axis=-1).reshape(-1) for each in along) / len(lights)
-        matrices[:, MATERIALS, MATERIALS] += OTHER_BACKGROUNDS
-        seen = SeenView(camera, trial.frame, sums, covered, matrices)
-        carried = np.zeros((len(sums), 48), np.float32)
-        carried[covered, : len(TRIANGLE[0])] = matrices[:, TRIANGLE[0], TRIANGLE[1]]
-        carried[:, len(TRIANGLE[0])], carried[:, len(TRIANGLE[0]) + 1] = edges, 1.0
+        covered = np.flatnonzero(images.alpha.numpy() > LEAST_ALPHA)
+        forms, edges = self._forms(camera, images, covered, lights)
+        places = np.full(len(images.alpha), -1, np.int32)
+        places[covered] = np.arange(len(covered))
+        rows = wp.array(places, dtype=int, device=self._device)
+        seen = SeenView(camera, trial.frame, wp.clone(images.channels[0]), wp.clone(images.alpha), rows, forms)
         depth = float(np.linalg.norm(camera.position - self._cloud.positions.mean(axis=0)))
-        return seen, self._carried_back(rasterizer, carried), depth / camera.focal_y
+        return seen, self._carried_back(rasterizer, seen, edges), depth / camera.focal_y
 
-    def _shades(self, camera: Camera, images: RasterImages, sums: FloatArray, light: Trial) -> FloatArray:
-        """Return what pixels show, encoded, as they are and with each sum changed by its step, ``(10, P, 3)``."""
+    def _forms(
+        self, camera: Camera, images: RasterImages, covered: NDArray[np.int64], lights: Sequence[Trial]
+    ) -> tuple[wp.array, wp.array]:
+        """Return the forms of covered pixels, ``(C, 45)``, and the squared slope of the image at every pixel."""
+        count, device = len(images.alpha), self._device
+        pixels = wp.array(covered.astype(np.int32), dtype=int, device=device)
+        steps = wp.array(STEPS.astype(np.float32), dtype=float, device=device)
+        views = wp.array(ViewLayout.of([camera]).views, dtype=RasterView, device=device)
+        forms, edges = wp.zeros((len(covered), FORM), dtype=float, device=device), wp.zeros(count, float, device=device)
+        shades = wp.zeros((COLUMNS + 1, count), dtype=wp.vec4, device=device)
+        nudged = []
+        for column, step in ((COLUMNS, 0.0), *enumerate(STEPS)):
+            rows, alpha = wp.empty_like(images.channels[0]), wp.empty_like(images.alpha)
+            launch_nudge(count, images.channels[0], images.alpha, column, float(step), rows, alpha, device)
+            nudged.append(RasterImages((rows,), alpha, images.depth, images.median_depth))
+        share = 1.0 / len(lights)
+        for light in lights:
+            self._light(light)
+            for row, drawn in enumerate(nudged):
+                launch_shade_gaussians(views, drawn, False, self._arriving.scene_light(), shades[row], device)
+            launch_add_forms(len(covered), pixels, shades, steps, share, forms, device)
+            launch_add_edges(count, camera.width, camera.height, shades, share, edges, device)
+        own = forms.numpy()
+        own[:, -1] += OTHER_BACKGROUNDS
+        forms.assign(own)
+        return forms, edges
+
+    def _light(self, light: Trial) -> None:
+        """Take the lights of a draw, without shadows: their maps cost more than all the rest."""
         environment, lamps = self._trials.lights(light, self._cloud)
         self._arriving.set_environment(environment, light.turn, self._casters, moved=False)
-        lamps = tuple(replace(lamp, casts_shadows=False) for lamp in lamps)  # maps cost more than all the rest
+        lamps = tuple(replace(lamp, casts_shadows=False) for lamp in lamps)
         self._arriving.set_lights(lamps, self._casters, moved=False)
-        views = wp.array(ViewLayout.of([camera]).views, dtype=RasterView, device=self._device)
-        out = wp.zeros(len(sums), dtype=wp.vec4, device=self._device)
-        shades = np.zeros((COLUMNS + 1, len(sums), 3), np.float32)
-        for column in range(-1, COLUMNS):
-            changed = sums.copy()
-            if column >= 0:
-                changed[:, column] += STEPS[column]
-            empty = changed[:, MATERIALS] <= 0.0
-            rows = wp.array(changed[:, :MATERIALS], dtype=float, device=self._device)
-            alpha = wp.array(np.where(empty, 0.0, changed[:, MATERIALS]), dtype=float, device=self._device)
-            drawn = RasterImages((rows,), alpha, images.depth, images.median_depth)
-            launch_shade_gaussians(views, drawn, False, self._arriving.scene_light(), out, self._device)
-            shades[column + 1] = linear_to_srgb(np.clip(out.numpy()[:, :3], 0.0, 1.0))
-        return shades
 
-    def _carried_back(self, rasterizer: Rasterizer, pixels: FloatArray) -> FloatArray:
-        """Return the sums over pixels, by the weight of each Gaussian there, of numbers of pixels, ``(N, 48)``."""
-        parts = []
-        for start in range(0, pixels.shape[1], 16):
-            out = wp.empty((len(self._cloud), 16), dtype=float, device=self._device)
-            part = np.ascontiguousarray(pixels[:, start : start + 16])
-            rasterizer.back_project(wp.array(part, dtype=float, device=self._device), out)
+    def _carried_back(self, rasterizer: Rasterizer, seen: SeenView, edges: wp.array) -> FloatArray:
+        """Return the sums over pixels, by each Gaussian's weight there, of forms, slopes and 1, ``(N, 48)``."""
+        parts, out = [], wp.empty((len(self._cloud), PASS), dtype=float, device=self._device)
+        pixels = wp.empty((len(edges), PASS), dtype=float, device=self._device)
+        for start in range(0, CARRIED, PASS):
+            launch_carry(len(edges), start, seen.places, seen.forms, edges, pixels, self._device)
+            rasterizer.back_project(pixels, out)
             parts.append(out.numpy().copy())
         return np.concatenate(parts, axis=1)
 
@@ -218,8 +232,3 @@ class _Meter:
 def material_rows(cloud: GaussianCloud) -> FloatArray:
     """Return the materials of Gaussians in the order of `COLUMNS`, ``(N, 8)``."""
     return np.concatenate([getattr(cloud, name).reshape(len(cloud), -1) for name in MATERIAL_CHANNELS], axis=1)
-
-
-def pixel_sums(images: RasterImages) -> FloatArray:
-    """Return the sums of pixels in the order of `COLUMNS`, ``(P, 9)``."""
-    return np.concatenate([images.channels[0].numpy()[:, :MATERIALS], images.alpha.numpy()[:, None]], axis=1)

@@ -23,7 +23,7 @@ from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reduction import job
 from beam_warp.reduction.job import ReduceOptions, Reducer, reduce_asset
 from beam_warp.reduction.sensitivity import LIGHTS as EACH
-from beam_warp.reduction.sensitivity import MATERIALS, material_rows, pixel_sums
+from beam_warp.reduction.sensitivity import MATERIALS, material_rows
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
@@ -79,8 +79,10 @@ def test_quadratic_forms_predict_the_error_of_a_small_change(reducer):
 
     device = resolve_device("cpu")
     drawer = Rasterizer(len(cloud), [view.camera], value_count=MATERIALS, options=RASTER, device=device)
-    sums = pixel_sums(drawer.draw(upload_gaussians(other, device, values=material_rows(other))))
-    predicted, _ = view.error(sums)
+    images, slopes = drawer.draw(upload_gaussians(other, device, values=material_rows(other))), drawer.adjoints()
+    view.slopes(images, slopes)
+    away = images.channels[0].numpy() - view.target.numpy(), images.alpha.numpy() - view.alpha.numpy()
+    predicted = 0.5 * (np.vdot(away[0], slopes.channels[0].numpy()) + np.vdot(away[1], slopes.alpha.numpy()))
     renderer, total = DeferredRenderer(compared_options(32), raster=RASTER, device="cpu"), 0.0
     trials = reducer.trials.draw("search", range(QUICK.views, QUICK.views + EACH), [0])
     for trial in trials:

@@ -1,0 +1,1 @@
+"""Reduction: quadratic forms of relit images, and what a refit moves."""
