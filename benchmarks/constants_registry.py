@@ -339,6 +339,7 @@ MATERIALS = (
             ("LEAST_CHANCE", "Least probability of a roughness."),
             ("LEAST_SPREAD", "Least standard deviation of a colour."),
             ("FIT_GAUSSIANS", "Gaussians of the surface at which views are compared."),
+            ("FIT_STEPS", "Steps of its fit."),
         )
     ),
     *(

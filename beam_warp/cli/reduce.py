@@ -55,7 +55,7 @@ class Reduce:
     pairs: Annotated[int, arg(metavar="N", help="Draws of light, camera and frame for the certificate.")] = 200
     confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate.")] = 0.95
     views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 48
-    steps: Annotated[Annotated[int, arg(metavar="N", help="Steps of a refit.")], SECOND_PAGE] = 200
+    steps: Annotated[Annotated[int, arg(metavar="N", help="Steps of a refit.")], SECOND_PAGE] = 600
     reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
     seed: Seed = 0
     device: Device = None

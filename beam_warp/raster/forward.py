@@ -14,6 +14,7 @@ from beam_warp.kernels.raster.bin_tiles import (
     launch_emit_pairs,
     launch_find_ranges,
     launch_key_splats,
+    launch_order_tiles,
 )
 from beam_warp.kernels.raster.channel_rows import launch_evaluate_colors, launch_gather_channels
 from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
@@ -120,6 +121,10 @@ def list_pairs(buffers: FrameBuffers) -> None:
     launch_emit_pairs(buffers.order, buffers.splats, buffers.views, buffers.gaussian_count, band, pairs, buffers.device)
     wp.utils.radix_sort_pairs(pairs.tiles, pairs.slots, buffers.pair_capacity, end_bit=tile_count.bit_length())
     launch_find_ranges(pairs, tile_count, frame.lists, buffers.device)
+    if buffers.device.is_cuda:
+        buffers.tile_counts.zero_()
+        tiles = frame.lists.ranges[:tile_count], buffers.order.ends
+        launch_order_tiles(tile_count, *tiles, buffers.tile_counts, frame.lists.order[:tile_count], buffers.device)
 
 
 def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) -> None:

@@ -89,8 +89,9 @@ LEAST_CHANCE, LEAST_VARIANCE = 0.01, 1e-4
 LEAST_SPREAD = 0.01
 """Least standard deviation of a colour that is assumed, of itself: that of eight bits and of filters."""
 
-FIT_GAUSSIANS = 10_000
-"""Most Gaussians of the surface at which views are compared."""
+FIT_GAUSSIANS, FIT_STEPS = 20_000, 900
+"""Most Gaussians of the surface at which views are compared, and steps of their fit: where highlights are depends on
+normals. With those of a finished fit, exposures of walker and runner are found to 1 %, of 450 steps to 2."""
 
 LARGEST_SIDE = 320
 """Pixels of a side at which views are compared, about."""
@@ -163,7 +164,15 @@ def _surface(
     """Return Gaussians that a quick fit brings to the surface, and their normals, 0 where these are not known."""
     count = min(options.gaussian_count, FIT_GAUSSIANS)
     start = initial_gaussians(views, count, device=device, seed=options.seed)
-    fitting = FitOptions.of_preset("draft", gaussian_count=count, raster=options.raster, samples=1, seed=options.seed)
+    fitting = FitOptions.of_preset(
+        "draft",
+        gaussian_count=count,
+        color_iterations=FIT_STEPS // 3,
+        normal_iterations=FIT_STEPS - FIT_STEPS // 3,
+        raster=options.raster,
+        samples=1,
+        seed=options.seed,
+    )
     cloud = fit_gaussians(views, start, fitting, device=device, progress=progress).cloud
     outward = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])
     nearest = cKDTree(start.positions).query(cloud.positions, workers=-1)[1]

@@ -70,7 +70,7 @@ OVERSTEP = 1.6
 """Steps over what photographs say: Gaussians that were fitted to a photograph have followed its camera a part of
 the way."""
 
-SETTLED = 0.5
+SETTLED = 0.25
 """Rounds end when steps are so much smaller than the standard errors."""
 
 FAR = 1.0

@@ -93,7 +93,7 @@ class ReduceOptions:
     pairs: int = 200
     confidence: float = 0.95
     views: int = 48
-    steps: int = 200
+    steps: int = 600
     seed: int = 0
     raster: RasterOptions | None = None
     device: Any = None

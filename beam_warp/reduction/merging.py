@@ -21,10 +21,10 @@ from beam_warp.world.gaussians import GaussianCloud
 NEIGHBORS = 8
 """Nearest clusters that a cluster may merge with."""
 
-SPREAD = 0.5
+SPREAD = 0.25
 """Cost of a spread along the surface over that of one across it."""
 
-FLOOR = 5e-3
+FLOOR = 1e-3
 """Squared slope of images that is taken for granted everywhere [1/pixel^2]: what is near is merged first."""
 
 MERGED_AT_ONCE = 0.5

@@ -99,7 +99,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
     ):
         item = first + wp.tid()
         lane = item % LANES
-        listed = item / (SIDE * SIDE)
+        listed = frame.lists.order[item / (SIDE * SIDE)]
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
         part = (item % (SIDE * SIDE)) / LANES
