@@ -8,7 +8,6 @@ environment and its rotation, bounces and the pixel's filter are the same. Both 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -158,12 +157,10 @@ def picture(path: Path, shown: list[tuple[str, list[np.ndarray]]]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small pictures of few samples")
+    parser = record.parser(__doc__, quick="small pictures of few samples")
     parser.add_argument("--probes", nargs="+", choices=list(probes.PROBES), default=list(probes.PROBES))
     parser.add_argument("--picture", type=Path, metavar="JPG", help="the last probe, ours beside Cycles'")
     parser.add_argument("--side", type=int, metavar="PX", help=f"side of pictures, {FULL.side} by default")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     python = os.environ.get("BEAM_BPY", "").split(os.pathsep)[0]
     if not python:

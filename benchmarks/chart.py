@@ -5,7 +5,6 @@ python benchmarks/chart.py --device cpu --out benchmarks/results/chart_tracing_c
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -20,10 +19,8 @@ from beam_warp.world.shapes import still_life
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device")
+    parser = record.parser(__doc__, device=None)
     parser.add_argument("--budget-seconds", type=float, default=30.0, help="of measuring, after the references")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     names = {"name": "the built-in still life", "environment_name": "the built-in low sun"}

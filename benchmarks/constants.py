@@ -15,7 +15,6 @@ few Gaussians and a handful of constants. This is about scores only: no time is 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
@@ -49,8 +48,9 @@ from beam_warp.evaluate.views import ViewScorer
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.roughness import measure_roughness_profile, solve_roughness
 from beam_warp.mesh.distances import surface_distances
@@ -484,14 +484,10 @@ def measure(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
-    parser.add_argument("--device", help="cpu or cuda:0; the first GPU, or the CPU, without")
+    parser = record.parser(__doc__, device=None, data=True, quick="the demo's capture and a handful of constants")
     parser.add_argument("--workers", type=int, default=6, help="processes that share the device")
     parser.add_argument("--seconds", type=float, help="begin no row after so long")
     parser.add_argument("--only", nargs="+", choices=list(GROUPS), default=[], metavar="GROUP")
-    parser.add_argument("--quick", action="store_true", help="the demo's capture and a handful of constants")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     until = time.monotonic() + (arguments.seconds or math.inf)
     device = resolve_device(arguments.device)

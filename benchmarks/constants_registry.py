@@ -225,10 +225,10 @@ MESHING = (
 )
 
 MATERIALS = (
-    Constant("beam_warp.materials.direct:MaterialOptions.sample_count", BOTH, "Rays of a Gaussian.", more=2.0),
-    Constant("beam_warp.materials.direct:MaterialOptions.light_error", BOTH, "Error at which rays are as many."),
+    Constant("beam_warp.materials.light_rays:MaterialOptions.sample_count", BOTH, "Rays of a Gaussian.", more=2.0),
+    Constant("beam_warp.materials.light_rays:MaterialOptions.light_error", BOTH, "Error at which rays are as many."),
     Constant("beam_warp.materials.pilot:REACH", BOTH, "Neighbours whose rays tell how many a Gaussian needs."),
-    Constant("beam_warp.materials.direct:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
+    Constant("beam_warp.materials.light_rays:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
     Constant("beam_warp.materials.normals:LIFT_IN_REACHES", BOTH, "Lift of rays, in reaches of the Gaussians above."),
     Constant("beam_warp.materials.normals:FACE_SPREAD", BOTH, "Normals of one face, beside an edge [rad]."),
@@ -286,8 +286,8 @@ MATERIALS = (
     Constant("beam_warp.materials.base_color:SPECULAR_PART", JUDGED, "Least of stated relative errors.", NO_SCORE),
     Constant(EVIDENCE + "HEADROOM", JUDGED, "Part of a ceiling that counts as cut.", "the captures are not cut"),
     Constant("beam_warp.materials.direct:SATURATION", JUDGED, "Display colour that counts as cut.", NO_IMAGES),
-    Constant("beam_warp.materials.direct:VIEW_COUNT", JUDGED, "Directions that colour is read at.", NO_IMAGES),
-    Constant("beam_warp.materials.direct:SMALLEST_VIEW_COSINE", JUDGED, "Their least cosine.", NO_IMAGES),
+    Constant("beam_warp.materials.light_rays:VIEW_COUNT", JUDGED, "Directions that colour is read at.", NO_IMAGES),
+    Constant("beam_warp.materials.light_rays:SMALLEST_VIEW_COSINE", JUDGED, "Their least cosine.", NO_IMAGES),
     Constant("beam_warp.materials.normals:NEIGHBOR_COUNT", "spheres, planes", "Neighbours of a normal.", NO_IMAGES),
     Constant("beam_warp.materials.normals:FLAT_RATIO", "spheres, planes", "Flatness that tells a normal.", NO_IMAGES),
     Constant("beam_warp.materials.normals:ORIENTATION_RAYS", JUDGED, "Rays that find the open side.", NO_IMAGES),
@@ -557,7 +557,7 @@ UNTUNED = {
         beam_warp.materials.base_color: PAIRED PAIR_GROUPS MISSING
         beam_warp.materials.changes: LEAST_ERROR
         beam_warp.materials.evidence: SURFACE_CHANNELS PIXELS_AT_ONCE CUTTING_THREADS MARGIN
-        beam_warp.materials.direct: FEWEST_FIRST_RAYS
+        beam_warp.materials.light_rays: FEWEST_FIRST_RAYS
         beam_warp.materials.exposure: ASKED
         beam_warp.materials.images: UNLIT_PART WHOLE_ALPHA CROP_MARGIN UNSEEN_EVIDENCE
         beam_warp.materials.light: ASKED MOST_VIEWS NEAR
@@ -583,7 +583,7 @@ UNTUNED = {
         beam_warp.kernels.reconstruction.visual_hull: OUTSIDE SURFACE INSIDE
         beam_warp.kernels.reconstruction.patch_match: NEITHER WORST
         beam_warp.kernels.materials.residues: ALBEDO_SCALING FRESNEL_HV
-        beam_warp.materials.direct: DIFFUSE_WEIGHTS
+        beam_warp.materials.light_rays: DIFFUSE_WEIGHTS
         beam_warp.kernels.materials.bounded_solve: WALK FREE SHIFT
         beam_warp.kernels.render.gaussian_light: ROUGHNESS OCCLUSION NORMAL ARRIVING OPENNESS""",
 }

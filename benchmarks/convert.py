@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import os
 import re
 import subprocess
 import sys
@@ -30,10 +29,10 @@ from typing import Any
 
 import npm_packages
 import numpy as np
-import parts
 import record
 import warp as wp
 from convert_looks import Looks, difference, looks_of_cloud, looks_of_ply
+from parts import measure, say
 from timing import spread
 from write_lcc import write_lcc, write_lcc2
 
@@ -100,9 +99,6 @@ class Bench:
     reads: frozenset[str]
     writes: frozenset[str]
     data: Path
-
-    def say(self, line: str) -> None:
-        print(line, flush=True)
 
 
 @dataclass(frozen=True)
@@ -261,7 +257,7 @@ def speed(bench: Bench) -> Iterator[Row]:
     for count, source, ending in conversions(bench):
         row = {"gaussians": count, "from": suffix_of(source.name), "to": ending, **timed(bench, source, ending)}
         rows.append({"name": f"{row['from'][1:]} to {ending[1:]}", **row})
-        bench.say(f"{rows[-1]['name']}: {row['ours']['seconds']['median']:.2f} s")
+        say(f"{rows[-1]['name']}: {row['ours']['seconds']['median']:.2f} s")
         yield {"rows": rows}
 
 
@@ -430,14 +426,8 @@ PARTS = {"errors": errors, "files": files, "speed": speed, "sequence": sequence}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few Gaussians and one repeat")
-    parser.add_argument("--parts", nargs="*", default=[], choices=list(PARTS))
+    parser = record.parser(__doc__, data=True, quick="few Gaussians and one repeat", parts=PARTS)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument(
-        "--data", type=Path, default=Path(os.environ.get("BEAM_DATA", record.ROOT.parent / "shared/data"))
-    )
-    record.add_arguments(parser)
     args = parser.parse_args()
     for form in FORMATS.values():  # so that the result's list of code has what child processes load
         for module in filter(None, (form.reader, form.writer)):
@@ -462,7 +452,7 @@ def main() -> int:
             "formats": formats(bench),
         }
         keep = functools.partial(_keep, args, head)
-        found = parts.measure(PARTS, bench, only=args.parts, keep=keep)
+        found = measure(PARTS, bench, only=args.parts, keep=keep)
     return 1 if found["failed"] else 0
 
 

@@ -12,7 +12,6 @@ lowest of repeats counts.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import io
 import json
@@ -29,10 +28,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import parts
 import record
 import zstandard
 from delivery_take import FRAMES_PER_SECOND, take
+from parts import measure, say
 from PIL import Image
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
@@ -76,9 +75,6 @@ class Bench:
     repeats: int
     folder: Path
 
-    def say(self, line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
 
 def takes(bench: Bench) -> Iterator[Row]:
     """Measure every take at every bound."""
@@ -113,7 +109,7 @@ def takes(bench: Bench) -> Iterator[Row]:
                     "node_ms": node_ms(path, bench.repeats),
                 }
             )
-            bench.say(json.dumps(rows[-1]))
+            say(json.dumps(rows[-1]))
             yield {"rows": rows}
 
 
@@ -254,18 +250,15 @@ PARTS = {"takes": takes, "codecs": codecs}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a take of few Gaussians and frames")
-    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=[], help="measure these only")
+    parser = record.parser(__doc__, quick="a take of few Gaussians and frames", parts=PARTS)
     parser.add_argument("--repeats", type=int, default=9, metavar="N")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     settings = [(2_000, (1.0,))] if arguments.quick else [(30_000, (1.0, 4.0)), (140_000, (1.0,))]
     with tempfile.TemporaryDirectory(prefix="beam_delivery_") as folder:
         frames, height = (4, 60) if arguments.quick else (24, 200)
         bench = Bench(settings, frames, height, arguments.repeats, Path(folder))
         keep = functools.partial(record.write_result, arguments, resolve_device(None))
-        result = parts.measure(PARTS, bench, only=arguments.parts, keep=keep)
+        result = measure(PARTS, bench, only=arguments.parts, keep=keep)
         keep(result)
     return 1 if result["failed"] else 0
 

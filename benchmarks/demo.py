@@ -8,7 +8,6 @@ come from Warp's cache, within.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -19,10 +18,8 @@ from beam_warp.device.arrays import resolve_device
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device")
+    parser = record.parser(__doc__, device=None)
     parser.add_argument("--folder", type=Path, required=True, help="where the demo writes")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     report = run_demo(arguments.folder, DemoOptions(device=str(device))).report

@@ -12,8 +12,6 @@ many rays for each, whose sets begin alike. Seconds are of measuring all materia
 
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import record
-from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_reference, rms
+from materials_truth import Materials, PerfectFrame, TruthViews, light_reference, rms
 from numpy.typing import NDArray
 from timing import Task, spread, take_turns
 
@@ -30,9 +28,11 @@ from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialMeasurement, MaterialOptions, measure_materials
+from beam_warp.materials.direct import MaterialMeasurement, measure_materials
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.pilot import rays_needed
 from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.study.true_surface import SHARP
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_batches
 from beam_warp.world.environment import EnvironmentMap
@@ -171,14 +171,11 @@ def occlusion_of(subject: Subject, rays: int) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Measure every subject and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
-    parser.add_argument("--device", default="cpu")
+    parser = record.parser(__doc__, device="cpu", data=True)
     parser.add_argument("--captures", nargs="+", default=CAPTURES, choices=CAPTURES)
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--reference-rays", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=REPEATS)
-    record.add_arguments(parser)
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}

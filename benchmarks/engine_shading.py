@@ -1,6 +1,6 @@
 """Pictures by the shading source of engines against the deferred renderer, in every language and on every probe.
 
-    python benchmarks/engine_shading.py --out result.json [--picture docs/images/engine_probes.jpg]
+    python benchmarks/engine_shading.py --out result.json [--picture docs/images/engine_probes.webp]
 
 Probes and lights are those of ``tests/engines/probes.py``. The generated texts are run as they are committed: WGSL and
 HLSL on Vulkan, GLSL ES 3.00 in a headless browser, on the processor where there is no GPU. Each shades the G-buffer
@@ -9,7 +9,6 @@ that our rasteriser drew, so that what differs is arithmetic. A target whose too
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -33,9 +32,8 @@ BEHIND = (0.25, 0.25, 0.25)
 
 def main() -> int:
     """Measure every target, and write the result."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--picture", type=Path, metavar="JPG", help="the truth of all cases in one picture")
-    record.add_arguments(parser)
+    parser = record.parser(__doc__)
+    parser.add_argument("--picture", type=Path, metavar="WEBP", help="the truth of all cases in one picture")
     args = parser.parse_args()
     cases = list(goldens())
     rows: list[dict[str, Any]] = [
@@ -56,7 +54,7 @@ def main() -> int:
         panels = [
             (f"{c.probe}, {c.lighting}", display_over(c.image.rgb, c.image.alpha, background=BEHIND)) for c in cases
         ]
-        Image.fromarray(lay_out(panels, columns=6)).save(args.picture, quality=90, optimize=True)
+        Image.fromarray(lay_out(panels, columns=6)).save(args.picture, quality=85, method=6)
     return 0
 
 

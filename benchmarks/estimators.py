@@ -12,7 +12,6 @@ tracer share is therefore not in these errors. The ball also has curves of the e
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -261,11 +260,9 @@ def measure_sky(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record.parser(__doc__, device=None)
     parser.add_argument("--scene", choices=("ball", "figure"), default="ball")
-    parser.add_argument("--device", default=None)
     parser.add_argument("--points", type=int, default=192)
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     make = make_ball if arguments.scene == "ball" else make_figure
     scene, points, normals = make(arguments.device, arguments.points)

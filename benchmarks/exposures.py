@@ -8,12 +8,9 @@ is made wrong in turn. Writes the JSON after each number of cameras.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,12 +61,9 @@ def measure(views: Sequence[CapturedView], device: str) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
+    parser = record.parser(__doc__, device="cpu", data=True)
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], metavar="NAME")
     parser.add_argument("--cameras", nargs="+", type=int, default=[4, 6, 8, 12, 24], metavar="N")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for name in arguments.captures:

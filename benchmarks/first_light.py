@@ -9,7 +9,6 @@ float64 brute force, ambient occlusion at 64 rays against 4,096. The input's nam
 
 from __future__ import annotations
 
-import argparse
 import resource
 import sys
 import tempfile
@@ -25,7 +24,7 @@ from timing import Task, spread, take_turns
 from beam_warp import Scene, ambient_occlusion, converters, visibility
 from beam_warp.decomposition.job import RunOptions, run
 from beam_warp.device.arrays import resolve_device
-from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import estimate_normals
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.reference import visibility_reference
@@ -93,14 +92,12 @@ def measure_rays(path: Path, samples: int, device: Any, points: int) -> dict[str
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record.parser(__doc__, device=None)
     parser.add_argument("input", type=Path)
     parser.add_argument("--environment", type=Path, required=True)
-    parser.add_argument("--device", default=None)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--points", type=int, default=20_000, help="points for the ray rate")
     parser.add_argument("--repeats", type=int, default=3, help="measured runs of the job after the first")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     result: dict[str, Any] = {"samples": arguments.samples}

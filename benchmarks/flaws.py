@@ -340,9 +340,7 @@ def known_rows(arguments: argparse.Namespace) -> list[Row]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
+    parser = record.parser(__doc__, device="cpu", data=True)
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], metavar="NAME", help="or demo")
     parser.add_argument("--flaws", nargs="+", default=[CLEAN, TOGETHER, *FLAWS], metavar="NAME")
     parser.add_argument("--sizes", nargs="+", type=float, default=[1.0], metavar="S", help="over the nominal size")
@@ -351,7 +349,6 @@ def main() -> int:
     parser.add_argument("--gaussians", type=int, metavar="N", help="by default the preset's")
     parser.add_argument("--frames", type=int, default=1, metavar="N", help="with truth, from the first on")
     parser.add_argument("--seconds", type=float, help="begin no case that would end later")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     for name in arguments.flaws:
         if unknown := set(flaws_of(name)) - set(FLAWS):

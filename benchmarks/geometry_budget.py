@@ -13,9 +13,7 @@ the true normal (positive is outside), and angles between ours and the true norm
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -287,13 +285,10 @@ class Budget:
 
 def main() -> None:
     """Account for every capture and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
+    parser = record.parser(__doc__, device=None, data=True)
     parser.add_argument("--assets", type=Path, required=True, metavar="FOLDER", help="what beam run made of captures")
     parser.add_argument("--captures", nargs="+", default=CAPTURES, choices=CAPTURES)
     parser.add_argument("--rays", type=int, default=RAYS, help="rays of a pixel")
-    parser.add_argument("--device", default=None)
-    record.add_arguments(parser)
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}

@@ -13,7 +13,6 @@ process that nobody disturbed, and nothing half written. ``executions`` over ``s
 
 from __future__ import annotations
 
-import argparse
 import functools
 import os
 import random
@@ -28,9 +27,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import parts
 import psutil
 import record
+from parts import measure, say
 
 sys.path.insert(0, str(record.ROOT / "tests"))
 from support.toy_work import ToyWork, toy_plan
@@ -67,10 +66,6 @@ class Bench:
     kills: int
     seed: int
     nap: float
-
-    def say(self, words: str) -> None:
-        """Print a line."""
-        print(words, flush=True)
 
 
 def outputs(folder: Path) -> dict[str, bytes]:
@@ -112,7 +107,7 @@ def storm(bench: Bench, workers: str, kill: Callable[[random.Random, int], str])
             if outputs(out) != outputs(place / "whole") or lost or left:
                 raise RuntimeError(f"take {takes} must be whole, got {lost} steps lost, left over: {left}")
             takes, executions, steps = takes + 1, executions + calls, steps + len(again.steps)
-            bench.say(f"{takes} takes, killed {killed}")
+            say(f"{takes} takes, killed {killed}")
             yield {
                 "takes": takes,
                 "killed": dict(killed),
@@ -184,16 +179,13 @@ PARTS = {"processes": processes, "cluster": cluster}
 
 def main() -> None:
     """Kill, and write the result after every take."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="four kills, to see whether it runs")
+    parser = record.parser(__doc__, quick="four kills, to see whether it runs", parts=PARTS)
     parser.add_argument("--kills", type=int, default=100, help="at least, in each part")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--parts", nargs="+", choices=tuple(PARTS), default=())
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     bench = Bench(4 if arguments.quick else arguments.kills, arguments.seed, 0.1)
     keep = functools.partial(record.write_result, arguments, resolve_device("cpu"))
-    parts.measure(PARTS, bench, only=arguments.parts, keep=keep)
+    measure(PARTS, bench, only=arguments.parts, keep=keep)
 
 
 if __name__ == "__main__":

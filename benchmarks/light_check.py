@@ -14,8 +14,6 @@ about a light that is right is always wrong. Silence is no verdict; it is counte
 
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -169,11 +167,8 @@ def summary(cases: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main() -> None:
     """Run the sweep and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
-    parser.add_argument("--device", default="cpu")
+    parser = record.parser(__doc__, device="cpu", data=True)
     parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=SUBJECTS)
-    record.add_arguments(parser)
     given = parser.parse_args()
     device = str(resolve_device(given.device))
     cases = []

@@ -12,8 +12,6 @@ the same mean, in turn; what is said of each.
 
 from __future__ import annotations
 
-import argparse
-import os
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +26,7 @@ from beam_warp.materials.light import judge_light, light_evidence, possible_scal
 from beam_warp.materials.light_fits import LightEvidence
 from beam_warp.materials.light_turn import find_turn
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.reconstruction.scores import read_truth_mesh
-from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.study.true_surface import surface_of_capture
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 
@@ -45,10 +42,7 @@ SAME_LIGHT = 0.1
 def evidence_of(capture: Capture, device: str) -> LightEvidence:
     """Collect what Gaussians on the true surface show."""
     frame = capture.frames[0]
-    views = [record.view() for record in capture.select(split="train", frames={frame})]
-    mesh = read_truth_mesh(capture, frame)
-    bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), GAUSSIANS)
-    cloud = colored_by_views(bare, views, device=device)
+    cloud, views = surface_of_capture(capture, frame, GAUSSIANS, device=device)
     seen = view_evidence(cloud, [view.camera for view in views], views, device=device)
     scene = Scene.from_gaussians(cloud, device)
     return light_evidence(scene, SurfacePoints.seen_by(cloud, seen, scene), seen, ASKED)
@@ -127,10 +121,7 @@ def highlight_scales(evidence: LightEvidence, light: EnvironmentMap) -> dict[str
 
 def main() -> None:
     """Ask every capture and write what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("BEAM_DATA", "../shared/data"), help="data folder")
-    parser.add_argument("--device", default="cpu")
-    record.add_arguments(parser)
+    parser = record.parser(__doc__, device="cpu", data=True)
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}

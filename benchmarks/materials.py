@@ -18,11 +18,8 @@ says so in its place; the program returns 1 then.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import tempfile
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -38,7 +35,7 @@ from materials_cost import measure_cost
 from materials_evaluation import measure_evaluation, measure_roughness, subject_of
 from materials_perfect import measure_perfect
 from materials_truth import TruthViews, row_of
-from parts import Row, measure
+from parts import Row, measure, say
 
 from beam_warp.capture.capture import Capture
 from beam_warp.device.arrays import resolve_device
@@ -62,9 +59,9 @@ def measure_ablation(bench: Bench) -> Iterator[Row]:
         for row in rows:
             entry = {"group": row.group, "name": row.name, **measure_row(row, subject, warm, truth, normals)}
             if "base_color" in entry:
-                bench.say(f"{name}, {row.group}, {row.name}: {row_of(entry)}, {entry['seconds']:.2f} s")
+                say(f"{name}, {row.group}, {row.name}: {row_of(entry)}, {entry['seconds']:.2f} s")
             else:
-                bench.say(f"{name}, {row.group}, {row.name}: {entry.get('unavailable') or entry.get('failed')}")
+                say(f"{name}, {row.group}, {row.name}: {entry.get('unavailable') or entry.get('failed')}")
             part["rows"].append(entry)
             yield result
 
@@ -94,7 +91,7 @@ def measure_scale(bench: Bench) -> Iterator[Row]:
     """Yield what it costs so far."""
     capture = next(iter(bench.captures.values()))
     result: Row = {}
-    for name, part in measure_cost(capture, bench.light_of(capture), bench.effort.scale, bench.device, bench.say):
+    for name, part in measure_cost(capture, bench.light_of(capture), bench.effort.scale, bench.device):
         result[name] = part
         yield result
 
@@ -109,27 +106,17 @@ PARTS: dict[str, Callable[[Bench], Iterator[Row]]] = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
+    parser = record.parser(__doc__, device="cpu", data=True, quick="the demo's capture, small", parts=PARTS)
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], help="names there")
     parser.add_argument("--assets", type=Path, metavar="DIR", help="reconstructions, NAME/gaussians.usda")
     parser.add_argument("--gaussians", type=int, default=140_000, help="of reconstructions that are made here")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="the direct path's assets, DIR/NAME/asset.usda")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="evaluated assets as materials_NAME.png")
-    parser.add_argument("--parts", nargs="+", default=(), choices=PARTS, metavar="PART", help="these parts only")
-    parser.add_argument("--quick", action="store_true", help="the demo's capture, small: does all of it run?")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    started = time.perf_counter()
-
-    def say(text: str) -> None:
-        print(f"{time.perf_counter() - started:7.1f} s  {text}", file=sys.stderr, flush=True)
-
     with tempfile.TemporaryDirectory() as folder:
         if arguments.quick:
-            bench = quick_bench(Path(folder), device, say)
+            bench = quick_bench(Path(folder), device)
         else:
             bench = Bench(
                 captures={name: Capture.read(arguments.data / "captures" / name) for name in arguments.captures},
@@ -138,7 +125,6 @@ def main() -> int:
                 effort=replace(FULL, gaussians=arguments.gaussians),
                 device=device,
                 folder=Path(folder),
-                say=say,
             )
         bench = replace(bench, keep=arguments.keep, pictures=arguments.pictures)
         keep = partial(record.write_result, arguments, device)

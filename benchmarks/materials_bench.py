@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,6 @@ class Bench:
         effort: How much is measured.
         device: Where.
         folder: For what is made on the way.
-        say: Hears what is being done.
         keep: Folder for the assets of the direct path; None for those that nobody needs afterwards.
         pictures: Folder for the pictures of them; None for none.
     """
@@ -97,7 +96,6 @@ class Bench:
     effort: Effort
     device: Any
     folder: Path
-    say: Callable[[str], None]
     keep: Path | None = None
     pictures: Path | None = None
 
@@ -112,23 +110,20 @@ def read_lights(data: Path) -> dict[str, EnvironmentMap]:
     return {name: EnvironmentMap.read(data / "hdri" / f"{name}.hdr") for name in LIGHTS}
 
 
-def quick_bench(folder: Path, device: Any, say: Callable[[str], None]) -> Bench:
-    """Return a bench that runs in no time, on the demo's capture and its own light."""
-    capture = write_demo_capture(
-        folder / "demo",
-        camera_count=6,
-        test_camera_count=1,
-        size=64,
-        samples=4,
-        frame_count=2,
-        relit={"sunset": sunset()},
-        device=str(device),
-    )
-    return bench_of_capture(capture, folder, device, say)
+def quick_capture(folder: Path, device: Any, **sizes: int) -> Capture:
+    """Return the demo's capture, so small that all runs in no time, relit by one more light."""
+    relit = {"sunset": sunset()}
+    return write_demo_capture(folder / "demo", samples=4, relit=relit, device=str(device), **sizes)
 
 
-def bench_of_capture(capture: Capture, folder: Path, device: Any, say: Callable[[str], None]) -> Bench:
+def quick_bench(folder: Path, device: Any) -> Bench:
+    """Return a bench of the demo's capture and its own light."""
+    sizes = {"camera_count": 6, "test_camera_count": 1, "size": 64, "frame_count": 2}
+    return bench_of_capture(quick_capture(folder, device, **sizes), folder, device)
+
+
+def bench_of_capture(capture: Capture, folder: Path, device: Any) -> Bench:
     """Return a quick bench of one capture."""
     assert capture.environment_path is not None
     lights = {"its own": EnvironmentMap.read(capture.environment_path)}
-    return Bench({"demo": capture}, lights, None, QUICK, device, folder, say)
+    return Bench({"demo": capture}, lights, None, QUICK, device, folder)

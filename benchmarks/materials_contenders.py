@@ -19,9 +19,10 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.jobs.progress import StageTimer
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import ColorEvidence, MaterialOptions, measure_materials
+from beam_warp.materials.direct import ColorEvidence, measure_materials
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.roughness import measure_roughness_profile, solve_roughness
 from beam_warp.raster.records import RasterOptions

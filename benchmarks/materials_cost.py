@@ -5,15 +5,14 @@ Images are drawn by the rasteriser once, before the clock starts, and lie in mem
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from device_memory import peak_memory
 from materials_contenders import OURS, Method, Subject, SubjectFrame, by_images, direct
-from materials_truth import SHARP
-from parts import Row
+from parts import Row, say
 from timing import spread
 
 from beam_warp.capture.capture import Capture
@@ -23,7 +22,7 @@ from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.gbuffer import upload_gaussians
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.reconstruction.scores import read_truth_mesh
-from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.study.true_surface import SHARP, surface_of_capture
 from beam_warp.trace.denoise import chosen_denoiser
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -50,11 +49,7 @@ class Scale:
 
 def figure(capture: Capture, count: int, device: Any) -> GaussianCloud:
     """Return Gaussians on the true surface of the capture's first frame, with its colours."""
-    frame = capture.frames[0]
-    mesh = read_truth_mesh(capture, frame)
-    views = [record.view() for record in capture.select(split="train", frames=[frame])]
-    bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
-    return colored_by_views(bare, views, options=SHARP, device=str(device))
+    return surface_of_capture(capture, capture.frames[0], count, options=SHARP, device=str(device))[0]
 
 
 def drawn_views(cloud: GaussianCloud, cameras: Sequence[Camera], device: Any) -> list[CapturedView]:
@@ -78,9 +73,7 @@ def drawn_views(cloud: GaussianCloud, cameras: Sequence[Camera], device: Any) ->
     return views
 
 
-def measure_cost(
-    capture: Capture, light: PreparedEnvironment, scale: Scale, device: Any, say: Callable[[str], None]
-) -> Iterable[tuple[str, Row]]:
+def measure_cost(capture: Capture, light: PreparedEnvironment, scale: Scale, device: Any) -> Iterable[tuple[str, Row]]:
     """Yield the scene and what each way costs on it, each as soon as it is measured."""
     cloud = figure(capture, scale.gaussians, device)
     width, height = scale.size

@@ -13,7 +13,7 @@ import numpy as np
 from materials_bench import Bench
 from materials_contenders import Subject, SubjectFrame
 from numpy.typing import NDArray
-from parts import Row
+from parts import Row, say
 
 from beam_warp import converters
 from beam_warp.capture.capture import CaptureRecord
@@ -28,9 +28,9 @@ from beam_warp.evaluate.sheet import evaluation_sheet
 from beam_warp.evaluate.views import ScoredView
 from beam_warp.image.files import write_png
 from beam_warp.image.metrics import Score, compare
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.images import ImagePathOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.roughness import RoughnessEstimate, measure_roughness_profile, solve_roughness
 from beam_warp.raster.records import RasterOptions
@@ -114,7 +114,7 @@ def measure_evaluation(bench: Bench) -> Iterator[Row]:
             part["ways"][way] = row = evaluate(bench, name, frames_of(sequence, chosen), way, options)
             mean = row["mean"]
             relit = {f"{r}, {light}": f"{s['psnr']:.2f}" for r, by in mean["relit"].items() for light, s in by.items()}
-            bench.say(f"{name}, {way}: base colour {mean['base_color']['psnr']:.2f} dB, relit {relit}")
+            say(f"{name}, {way}: base colour {mean['base_color']['psnr']:.2f} dB, relit {relit}")
             yield result
         yield result
 
@@ -195,7 +195,7 @@ def measure_roughness(bench: Bench) -> Iterator[Row]:
                 "median_stated_error": found.report["median_error"],
             }
             part["rows"].append(row)
-            bench.say(f"{name}, roughness of {count} frames: {score.psnr:.2f} dB, median |z| {row['median_z']:.2f}")
+            say(f"{name}, roughness of {count} frames: {score.psnr:.2f} dB, median |z| {row['median_z']:.2f}")
             yield result
 
 

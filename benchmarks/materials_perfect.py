@@ -8,13 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from materials_bench import Bench
-from materials_truth import SHARP, Materials, PerfectFrame, TruthViews, light_errors, light_reference, row_of
-from parts import Row
+from materials_truth import Materials, PerfectFrame, TruthViews, light_errors, light_reference, row_of
+from parts import Row, say
 
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.study.true_surface import SHARP
 
 
 def measure_perfect(bench: Bench) -> Iterator[Row]:
@@ -24,9 +26,7 @@ def measure_perfect(bench: Bench) -> Iterator[Row]:
         frame = truth_frames(capture)[0]
         started = time.perf_counter()
         perfect = PerfectFrame.of(capture, frame, bench.effort.perfect_gaussians, bench.device)
-        bench.say(
-            f"{name}: {len(perfect.cloud):,} Gaussians on the true surface, {time.perf_counter() - started:.1f} s"
-        )
+        say(f"{name}: {len(perfect.cloud):,} Gaussians on the true surface, {time.perf_counter() - started:.1f} s")
         row: Row = {"gaussians": len(perfect.cloud), "seen": float(perfect.evidence.seen.mean()), "rows": []}
         result["captures"][name] = row
         row["irradiance"] = perfect_light(bench, perfect)
@@ -34,7 +34,7 @@ def measure_perfect(bench: Bench) -> Iterator[Row]:
         truth = TruthViews(capture, frame, SHARP, bench.effort.perfect_samples, str(bench.device))
         for entry in perfect_materials(bench, perfect, truth):
             row["rows"].append(entry)
-            bench.say(f"{name}, {entry['name']}: {row_of(entry)}")
+            say(f"{name}, {entry['name']}: {row_of(entry)}")
             yield result
 
 
@@ -67,9 +67,7 @@ def perfect_light(bench: Bench, perfect: PerfectFrame) -> Row:
             },
         }
         default = found[name]["ways"]["product, ratio, Owen"]
-        bench.say(
-            f"light {name}: {default['relative_rmse']:.4f} at each point, {default['rmse_over_mean']:.4f} of the mean"
-        )
+        say(f"light {name}: {default['relative_rmse']:.4f} at each point, {default['rmse_over_mean']:.4f} of the mean")
     return found
 
 

@@ -18,7 +18,8 @@ GROUPS = {"ladder": "C0", "one idea taken away": "C2", "image path": "C1"}
 
 def draw_perfect(part: Row, path: Path) -> None:
     """Draw errors of light on every environment, and scores of materials."""
-    plt = _pyplot()
+    from matplotlib import pyplot as plt
+
     figure, panels = plt.subplots(1, 3, figsize=(16, 5.4), layout="constrained")
     lights: dict[str, dict[str, list[float]]] = {}
     for row in part["captures"].values():
@@ -53,7 +54,8 @@ def draw_perfect(part: Row, path: Path) -> None:
 
 def draw_ablation(part: Row, path: Path) -> None:
     """Draw scores and scale of every row, a column of panels a measure and a row of them a capture."""
-    plt = _pyplot()
+    from matplotlib import pyplot as plt
+
     captures = part["captures"]
     longest = max(len(capture["rows"]) for capture in captures.values())
     figure, panels = plt.subplots(
@@ -82,7 +84,8 @@ def draw_ablation(part: Row, path: Path) -> None:
 
 def draw_cost(part: Row, path: Path) -> None:
     """Draw the stages of one frame in every way."""
-    plt = _pyplot()
+    from matplotlib import pyplot as plt
+
     ways = {name: row for name, row in part.items() if isinstance(row, Mapping) and "stages" in row}
     figure, axes = plt.subplots(figsize=(9, 0.6 + 0.55 * len(ways)), layout="constrained")
     stages = list(dict.fromkeys(stage for row in ways.values() for stage in row["stages"]))
@@ -107,13 +110,13 @@ def draw_cost(part: Row, path: Path) -> None:
 
 
 def draw_sheet(sheet: Path, path: Path) -> None:
-    """Write a sheet that the evaluation drew, smaller and with a palette: it lies in the repository."""
+    """Write a sheet that the evaluation drew, smaller: it lies in the repository."""
     from PIL import Image
 
     with Image.open(sheet) as picture:
         small = picture.convert("RGB")
         small.thumbnail((SHEET_WIDTH, small.height))
-        small.quantize(128).save(path, optimize=True)
+        small.save(path)
 
 
 def _bars(axes: Any, labels: Sequence[str], values: Sequence[float], colors: Sequence[str]) -> None:
@@ -126,12 +129,3 @@ def _bars(axes: Any, labels: Sequence[str], values: Sequence[float], colors: Seq
     axes.set_yticks(range(len(values)), labels, fontsize=7)
     axes.invert_yaxis()
     axes.margins(x=0.12)
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot

@@ -23,16 +23,13 @@ from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.study.materials import without_color
-from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.study.true_surface import SHARP, colored_by_views, gaussians_on_mesh, surface_of_capture
 from beam_warp.trace.incident import irradiance
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.shot import Shot
-
-SHARP = RasterOptions(antialiased=True, low_pass=0.1)
-"""Drawing of Gaussians on the true surface: truth is filtered by a box, which samples of a pixel do."""
 
 REFERENCE_SEED = 1 << 31
 """References draw other samples than what is measured, whose seeds count up from 0."""
@@ -162,10 +159,7 @@ class PerfectFrame:
     @classmethod
     def of(cls, capture: Capture, frame: int, count: int, device: Any) -> PerfectFrame:
         """Sample the truth's mesh, and solve colours from the training images."""
-        mesh = read_truth_mesh(capture, frame)
-        views = [record.view() for record in capture.select(split="train", frames=[frame])]
-        bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
-        cloud = colored_by_views(bare, views, options=SHARP, device=str(device))
+        cloud, views = surface_of_capture(capture, frame, count, options=SHARP, device=str(device))
         evidence = view_evidence(cloud, [v.camera for v in views], views, options=SHARP, device=str(device))
         return cls(capture, frame, cloud, Scene.from_gaussians(cloud, str(device)), views, evidence)
 

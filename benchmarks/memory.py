@@ -10,7 +10,6 @@ compiled and caches filled there; its standard error is that of the scatter of t
 
 from __future__ import annotations
 
-import argparse
 import functools
 import json
 import resource
@@ -32,7 +31,7 @@ from beam_warp.decomposition.work import MaterialWork
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.demo.from_images import FromImagesOptions, demo_steps
 from beam_warp.device.arrays import resolve_device
-from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.reconstruction.job import ReconstructionWork, ReconstructOptions
 from beam_warp.world.environment import EnvironmentMap
 
@@ -115,11 +114,8 @@ def long_capture(folder: Path, frames: int, device: str | None) -> Capture:
 
 def main() -> None:
     """Measure, and write the result every few frames."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="100 frames, to see whether it runs")
+    parser = record.parser(__doc__, device=None, quick="100 frames, to see whether it runs")
     parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--device", default=None)
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     with tempfile.TemporaryDirectory() as name:

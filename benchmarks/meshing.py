@@ -10,7 +10,6 @@ equal weights, unseen voxels in front of everything, marching cubes over the who
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from dataclasses import asdict
@@ -180,12 +179,9 @@ def compare(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device")
-    parser.add_argument("--quick", action="store_true", help="small images and one repeat")
+    parser = record.parser(__doc__, device=None, quick="small images and one repeat")
     parser.add_argument("--side", type=int, default=256, metavar="PX", help="of the depth images")
     parser.add_argument("--repeats", type=int, default=3)
-    record.add_arguments(parser)
     args = parser.parse_args()
     device = resolve_device(args.device)
     side, repeats, count = (96, 1, 8_000) if args.quick else (args.side, args.repeats, 45_000)

@@ -5,7 +5,6 @@ python benchmarks/parity.py demo/asset.usda --environment demo/lights/sunset.exr
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -23,10 +22,9 @@ DEVICES = ("cpu", "cuda:0")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record.parser(__doc__)
     parser.add_argument("asset", type=Path)
     parser.add_argument("--environment", type=Path, required=True)
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     cloud = change_axes(read(arguments.asset)[0], "rfu")
     environment = EnvironmentMap.read(arguments.environment)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,9 +10,21 @@ from typing import Any
 
 Row = dict[str, Any]
 
+STARTED = time.perf_counter()
+
+
+def say(text: str) -> None:
+    """Print a line to stderr, with the seconds since the program began."""
+    print(f"{time.perf_counter() - STARTED:7.1f} s  {text}", file=sys.stderr, flush=True)
+
+
+def once(part: Callable[[Any], Any]) -> Callable[[Any], Iterator[Any]]:
+    """Return what `measure` takes, of a part that returns all it found."""
+    return lambda bench: iter([part(bench)])
+
 
 def measure(
-    parts: Mapping[str, Callable[[Any], Iterator[Row]]],
+    parts: Mapping[str, Callable[[Any], Iterator[Any]]],
     bench: Any,
     *,
     only: Sequence[str] = (),
@@ -21,7 +34,7 @@ def measure(
 
     Args:
         parts: Each yields what it knows so far, whenever there is more.
-        bench: What they share; its ``say`` hears how long each took.
+        bench: What they share.
         only: These parts only; all where empty.
         keep: Told everything so far, whenever there is more.
     """
@@ -32,11 +45,10 @@ def measure(
             for state in parts[name](bench):
                 result[name] = state
                 keep(result)
-            result[name]["part_seconds"] = time.perf_counter() - started
-        except Exception:
-            result.setdefault(name, {})["failed"] = traceback.format_exc()
+        except Exception as error:  # minutes on a lent device are not lost to what comes later
+            traceback.print_exc()
+            result.setdefault(name, {})["failed"] = f"{type(error).__name__}: {error}"
             result["failed"].append(name)
-            bench.say(traceback.format_exc())
-        keep(result)
-        bench.say(f"{name}: {time.perf_counter() - started:.1f} s")
+            keep(result)
+        say(f"{name}: {time.perf_counter() - started:.1f} s")
     return result

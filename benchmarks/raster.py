@@ -14,11 +14,8 @@ says so in its place, and the program returns 1. Writes the JSON after each sect
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
-import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -28,11 +25,12 @@ import record
 from gsplat_peer import GsplatPeer, GsplatUnavailableError, kernel_seconds
 from gsplat_peer import Images as PeerImages
 from numpy.typing import NDArray
+from parts import measure, once, say
 from raster_contenders import Clocked, Drawing, Measured, Seen, captured, digits, measure_in_turn, random_adjoints
 from raster_scenes import RasterScene, cube, figure, growth
 from raster_stages import measure_stages
 from raster_truth import Truth, brute_force
-from timing import launch_threads, machine
+from timing import launch_threads
 
 from beam_warp.device.arrays import resolve_device
 from beam_warp.raster.records import RasterOptions
@@ -344,9 +342,9 @@ def measure_variants(effort: Effort, device: Any) -> Row:
 def sampled_pixels(seen: Seen, count: int) -> NDArray[np.int64]:
     """Return some pixels that see something, half of them where the coverage is partial, as at silhouettes."""
     even = np.flatnonzero(seen.alpha > 1e-3)
-    partial = np.flatnonzero((seen.alpha > 1e-3) & (seen.alpha < 0.99))
+    partly = np.flatnonzero((seen.alpha > 1e-3) & (seen.alpha < 0.99))
     pick = lambda rows: rows[np.linspace(0, len(rows) - 1, min(count // 2, len(rows))).astype(np.int64)]  # noqa: E731
-    return np.union1d(pick(even), pick(partial))
+    return np.union1d(pick(even), pick(partly))
 
 
 def errors(seen: Seen, pixels: NDArray[np.int64], truth: Truth, depth: str) -> Row:
@@ -364,7 +362,7 @@ def errors(seen: Seen, pixels: NDArray[np.int64], truth: Truth, depth: str) -> R
     return found
 
 
-def measure_growth(effort: Effort, device: Any, say: Callable[[str], None]) -> Row:
+def measure_growth(effort: Effort, device: Any) -> Row:
     """Time 11 channels and depth over the number of Gaussians, and over that of pixels."""
     found: Row = {"gaussians": [], "pixels": [], "repeats": effort.growth_repeats}
     for series, scene in growth(effort.counts, effort.sizes, count=effort.gaussians, size=effort.size):
@@ -484,60 +482,30 @@ def describe(scene: RasterScene) -> Row:
     return {"name": scene.name, "splats": len(scene.cloud), "width": camera.width, "height": camera.height}
 
 
-def sections(effort: Effort, device: Any, say: Callable[[str], None]) -> dict[str, Callable[[], Row]]:
-    """Return what is measured here, by name."""
-    found: dict[str, Callable[[], Row]] = {
-        "frames": lambda: measure_frames(effort, device),
-        "stages": lambda: measure_all_stages(effort, device),
-        "variants": lambda: measure_variants(effort, device),
-        "accuracy": lambda: measure_accuracy(effort, device),
-        "growth": lambda: measure_growth(effort, device, say),
+def sections(effort: Effort, device: Any) -> dict[str, Callable[[Any], Iterator[Row]]]:
+    """Return what is measured on a device, by name."""
+    found: dict[str, Callable[[Effort, Any], Row]] = {
+        "frames": measure_frames,
+        "stages": measure_all_stages,
+        "variants": measure_variants,
+        "accuracy": measure_accuracy,
+        "growth": measure_growth,
     }
-    return {"peer": lambda: measure_peer(effort, device), **found} if device.is_cuda else found
-
-
-def measure(
-    effort: Effort,
-    device: Any,
-    say: Callable[[str], None],
-    *,
-    only: Sequence[str] = (),
-    keep: Callable[[Row], None] = lambda result: None,
-) -> Row:
-    """Return everything that is measured, for JSON; ``say`` hears what is being done, ``keep`` gets each state."""
-    result: Row = {"machine": machine(device), "failed": []}
-    for name, run in sections(effort, device, say).items():
-        if only and name not in only:
-            continue
-        say(name)
-        started = time.perf_counter()
-        try:
-            result[name] = run()
-            result[name]["seconds"] = digits(time.perf_counter() - started)
-        except Exception as error:  # minutes on a lent device are not lost to what comes later
-            traceback.print_exc()
-            result[name] = {"failed": f"{type(error).__name__}: {error}"}
-            result["failed"].append(name)
-        result["load_average_after"] = machine(device)["load_average"]
-        keep(result)
-    return result
+    if device.is_cuda:
+        found = {"peer": measure_peer, **found}
+    return {name: once(partial(section, effort)) for name, section in found.items()}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    record.add_arguments(parser)
+    parser = record.parser(__doc__, device="cpu", quick="small scenes and few repeats: does all of it run?")
     parser.add_argument("--only", nargs="+", default=(), metavar="SECTION", help="measure these sections only")
-    parser.add_argument("--quick", action="store_true", help="small scenes and few repeats: does all of it run?")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     effort = QUICK if arguments.quick else ON_CUDA if device.is_cuda else ON_CPU
-    say = lambda text: print(text, file=sys.stderr, flush=True)  # noqa: E731
-    unknown = set(arguments.only) - set(sections(effort, device, say))
-    if unknown:
-        parser.error(f"--only must name sections of {', '.join(sections(effort, device, say))}, got {unknown}")
-    keep = partial(record.write_result, arguments, device)
-    result = measure(effort, device, say, only=arguments.only, keep=keep)
+    known = sections(effort, device)
+    if unknown := set(arguments.only) - set(known):
+        parser.error(f"--only must name sections of {', '.join(known)}, got {unknown}")
+    result = measure(known, device, only=arguments.only, keep=partial(record.write_result, arguments, device))
     return 1 if result["failed"] else 0
 
 

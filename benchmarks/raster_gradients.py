@@ -10,7 +10,6 @@ reads single precision can be better than. Writes JSON.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -101,9 +100,7 @@ def report(device: Any) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default=None)
-    record.add_arguments(parser)
+    parser = record.parser(__doc__, device=None)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     rows = report(device)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from raster_stages import BACKWARD, FORWARD, REST
+from tracing_plot import short_number
 
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
 """Timed parts in growth rows, and their titles."""
@@ -43,7 +44,8 @@ def draw_growth(results: Sequence[Mapping[str, Any]], path: Path) -> None:
         results: What ``raster.py`` writes as JSON; those without growth rows are left out.
         path: PNG to write.
     """
-    plt = _pyplot()
+    from matplotlib import pyplot as plt
+
     results = [result for result in results if _measured(result, "growth")]
     figure, panels = plt.subplots(2, 2, figsize=(12, 8.5), layout="constrained")
     for row, (part, called) in zip(panels, PARTS.items(), strict=True):
@@ -70,7 +72,8 @@ def draw_stages(results: Sequence[Mapping[str, Any]], path: Path) -> None:
         results: What ``raster.py`` writes as JSON; those without stages are left out.
         path: PNG to write.
     """
-    plt = _pyplot()
+    from matplotlib import pyplot as plt
+
     bars = [bar for result in results if _measured(result, "stages") for bar in _stage_bars(result)]
     figure, panels = plt.subplots(2, 1, figsize=(12, 2.5 + 0.55 * len(bars)), layout="constrained")
     for axes, way, order in zip(panels, ("forward", "backward"), (FORWARD, BACKWARD), strict=True):
@@ -149,7 +152,7 @@ def _log_axes(axes: Any) -> None:
     from matplotlib.ticker import FuncFormatter
 
     axes.set(xscale="log", yscale="log")
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda number, _: _short(number)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda number, _: short_number(number)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
     axes.grid(True, which="major", alpha=0.4)
     axes.grid(True, which="minor", alpha=0.12)
@@ -158,20 +161,3 @@ def _log_axes(axes: Any) -> None:
 def _plain(number: float) -> str:
     """Return three digits, or all of a larger number's."""
     return f"{number:.3g}" if number < 1000.0 else f"{number:.0f}"
-
-
-def _short(number: float) -> str:
-    """Return 140000 as 140k and 4000000 as 4M."""
-    for unit, letter in ((1e6, "M"), (1e3, "k")):
-        if number >= unit:
-            return f"{number / unit:g}{letter}"
-    return f"{number:g}"
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot

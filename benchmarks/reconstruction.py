@@ -17,14 +17,12 @@ scores and meshes are made after it stops. A section that fails says so in its p
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import gc
 import os
 import sys
 import tempfile
 import time
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,6 +32,7 @@ from typing import Any
 import numpy as np
 import record
 from device_memory import peak_memory
+from parts import measure, say
 from reconstruction_captures import write_large_capture
 from reconstruction_contenders import Contender, ModelledFrame, follow, of_options, write_sequence
 
@@ -123,7 +122,6 @@ class Bench:
         effort: Amount that is measured.
         make: Makes contenders.
         device: Where they run.
-        say: Hears what is being done.
         keep: Folder of the sequences of ``captures``; None for none.
     """
 
@@ -131,7 +129,6 @@ class Bench:
     effort: Effort
     make: Callable[[FitOptions, TrackOptions], Contender]
     device: Any
-    say: Callable[[str], None]
     keep: Path | None = None
 
     @property
@@ -146,7 +143,7 @@ class Bench:
 
     def follow(self, contender: Contender, capture: Capture, frames: Sequence[int]) -> Iterator[ModelledFrame]:
         """Fit the first of some frames, and track the others."""
-        return follow(contender, capture, frames, self.device, self.say)
+        return follow(contender, capture, frames, self.device)
 
     def scored(self, contender: Contender, modelled: ModelledFrame, capture: Capture) -> Row:
         """Return the scores of a frame: of test views where it has some, of its surface where that is known.
@@ -283,7 +280,7 @@ def measure_large(bench: Bench) -> Iterator[Row]:
             "seconds_to_path_trace": time.perf_counter() - started,
             "frames": [],
         }
-        bench.say(f"path traced in {found['seconds_to_path_trace']:.1f} s")
+        say(f"path traced in {found['seconds_to_path_trace']:.1f} s")
         draft = TrackOptions.of_preset("draft") if effort.tracking is not BRIEF else BRIEF
         contenders = [bench.make(bench.fitting, tracking) for tracking in (effort.tracking, draft)]
         track = None
@@ -291,7 +288,7 @@ def measure_large(bench: Bench) -> Iterator[Row]:
             frame, is_scored = capture.frames[index % 2], index < 2
             contender = contenders[0 if is_scored else 1]
             with peak_memory(bench.device) as peak:
-                modelled = next(follow(contender, capture, [frame], bench.device, bench.say, track=track))
+                modelled = next(follow(contender, capture, [frame], bench.device, track=track))
             track = modelled.track
             row = {"name": str(index), "steps": "default" if is_scored else "draft", "seconds": modelled.seconds}
             row |= memory(bench.device) | peak
@@ -416,37 +413,12 @@ SECTIONS: dict[str, Callable[[Bench], Iterator[Row]]] = {
 }
 
 
-def measure(bench: Bench, *, only: Sequence[str] = (), keep: Callable[[Row], None] = lambda result: None) -> Row:
-    """Return everything that is measured, for JSON; ``keep`` gets each state. What failed keeps what it had found."""
-    result: Row = {"failed": []}
-    for name, section in SECTIONS.items():
-        if only and name not in only:
-            continue
-        bench.say(name)
-        started = time.perf_counter()
-        result[name] = {}
-        try:
-            for state in section(bench):
-                result[name] = {**state, "section_seconds": time.perf_counter() - started}
-                keep(result)
-        except Exception as error:  # minutes on a lent device are not lost to what comes later
-            traceback.print_exc()
-            result[name] = {**result[name], "failed": f"{type(error).__name__}: {error}"}
-            result["failed"].append(name)
-            keep(result)
-    return result
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", "../shared/data")))
+    parser = record.parser(__doc__, device="cpu", data=True, quick="the demo's capture, small")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write the sequences of captures there")
-    record.add_arguments(parser)
     parser.add_argument(
         "--only", nargs="+", default=(), choices=SECTIONS, metavar="SECTION", help="these sections only"
     )
-    parser.add_argument("--quick", action="store_true", help="the demo's capture, small: does all of it run?")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     with tempfile.TemporaryDirectory() as folder:
@@ -460,10 +432,9 @@ def main() -> int:
             QUICK if arguments.quick else Effort(),
             lambda fitting, tracking: of_options(fitting, arguments.device, tracking),
             device,
-            lambda text: print(text, file=sys.stderr, flush=True),
             arguments.keep,
         )
-        result = measure(bench, only=arguments.only, keep=partial(record.write_result, arguments, device))
+        result = measure(SECTIONS, bench, only=arguments.only, keep=partial(record.write_result, arguments, device))
     return 1 if result["failed"] else 0
 
 

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import trimesh
 import warp as wp
+from parts import say
 
 from beam_warp import converters
 from beam_warp.capture.capture import Capture
@@ -99,13 +100,7 @@ class ModelledFrame:
 
 
 def follow(
-    contender: Contender,
-    capture: Capture,
-    frames: Sequence[int],
-    device: Any,
-    say: Callable[[str], None] = lambda text: None,
-    *,
-    track: Any = None,
+    contender: Contender, capture: Capture, frames: Sequence[int], device: Any, *, track: Any = None
 ) -> Iterator[ModelledFrame]:
     """Fit the first of some frames, unless there is a track already, and track the others; reading is not timed."""
     for frame in frames:

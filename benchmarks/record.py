@@ -13,11 +13,12 @@ import functools
 import hashlib
 import io
 import json
+import os
 import re
 import subprocess
 import sys
 import tokenize
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -47,12 +48,34 @@ CANNOT_CHANGE_A_NUMBER = (
 """Code that computes nothing: messages, progress, options; names of constants, which each row repeats."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every benchmark takes: where the result goes, and of which commit it is."""
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="JSON", help="what is written, for tables.py to print"
-    )
-    parser.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
+DIGITS = 8
+"""Hexadecimal digits of a file's digest: enough to see that it has changed."""
+
+
+def parser(
+    about: str | None, *, device: str | None = "", data: bool = False, quick: str = "", parts: Iterable[str] = ()
+) -> argparse.ArgumentParser:
+    """Return a parser with what benchmarks have in common; ``--out`` and ``--commit`` in any case.
+
+    Args:
+        about: The program's docstring.
+        device: Default of ``--device``: None is the first GPU, or the CPU; an empty text leaves the option out.
+        data: Whether there is ``--data``, the folder of captures.
+        quick: What ``--quick`` does; empty leaves it out.
+        parts: What ``--parts`` chooses from; empty leaves it out.
+    """
+    made = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--out", type=Path, required=True, metavar="JSON", help="what is written, for tables.py to print")
+    made.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
+    if device != "":
+        made.add_argument("--device", default=device, help="cpu or cuda:0")
+    if data:
+        made.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", ROOT.parent / "shared/data")))
+    if quick:
+        made.add_argument("--quick", action="store_true", help=quick)
+    if parts:
+        made.add_argument("--parts", nargs="+", default=(), choices=parts, metavar="PART", help="these parts only")
+    return made
 
 
 def write_result(arguments: argparse.Namespace, device: Any, result: Mapping[str, Any]) -> None:
@@ -70,7 +93,7 @@ def write_result(arguments: argparse.Namespace, device: Any, result: Mapping[str
         "date": datetime.now(UTC).date().isoformat(),
         "machine": machine(device),
         "versions": versions(),
-        "code": loaded_code(),
+        "code": by_folder(loaded_code()),
     }
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     partial = arguments.out.with_suffix(".partial")
@@ -129,12 +152,30 @@ def loaded_code() -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def by_folder(code: Mapping[str, str]) -> dict[str, str]:
+    """Return digests of files as a result file has them: ``{"beam_warp/world": "axes:cad7f293 camera:ec1f0425"}``."""
+    found: dict[str, str] = {}
+    for place, digest in code.items():
+        folder, _, name = place.removesuffix(".py").rpartition("/")
+        found[folder] = f"{found[folder]} {name}:{digest}" if folder in found else f"{name}:{digest}"
+    return found
+
+
+def _digests(code: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield files and digests of a result: its keys are folders (`by_folder`), or files."""
+    for place, said in code.items():
+        if place.endswith(".py"):
+            yield place, said
+        else:
+            yield from ((f"{place}/{name}.py", digest) for name, digest in (word.split(":") for word in said.split()))
+
+
 def changed_since(measured: Mapping[str, Any]) -> list[str]:
     """Return the files whose code is no longer what was measured; files that are gone are among them."""
     return [
         place
-        for place, digest in measured["code"].items()
-        if not place.startswith(CANNOT_CHANGE_A_NUMBER) and _digest_of_file(ROOT / place) != digest
+        for place, digest in _digests(measured["code"])
+        if not place.startswith(CANNOT_CHANGE_A_NUMBER) and _digest_of_file(ROOT / place) != digest[:DIGITS]
     ]
 
 
@@ -144,7 +185,7 @@ def _digest_of_file(path: Path) -> str | None:
 
 
 def code_digest(source: str) -> str:
-    """Return a digest of Python source without its comments, docstrings and blank lines, 12 hexadecimal digits."""
+    """Return the `DIGITS` digits of Python source without its comments, docstrings and blank lines."""
     lines = source.splitlines()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
@@ -155,7 +196,7 @@ def code_digest(source: str) -> str:
             last = node.end_lineno or node.lineno
             lines[node.lineno - 1 : last] = [""] * (last - node.lineno + 1)
     code = "\n".join(line.rstrip() for line in lines if line.strip())
-    return hashlib.sha256(code.encode()).hexdigest()[:12]
+    return hashlib.sha256(code.encode()).hexdigest()[:DIGITS]
 
 
 def content_digest(path: Path) -> str:

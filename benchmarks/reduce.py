@@ -23,7 +23,6 @@ images, stand for base colours. What splat-transform makes is kept beside the as
 
 from __future__ import annotations
 
-import argparse
 import functools
 import os
 import subprocess
@@ -37,11 +36,11 @@ from typing import Any
 
 import npm_packages
 import numpy as np
-import parts
 import record
 import warp as wp
 from delivery_take import take
 from numpy.typing import NDArray
+from parts import measure, say
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -57,12 +56,10 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.reduction.job import ReduceOptions, Reducer, reduce_asset
 from beam_warp.reduction.moments import Clusters, changed, shown_area
 from beam_warp.reduction.refit import refit
-from beam_warp.study.materials import SHARP
-from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.study.true_surface import SHARP, surface_of_capture
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.world.axes import change_axes
@@ -96,9 +93,6 @@ class Bench:
     made: Path | None
     device: Any
 
-    def say(self, line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
 
 def asset(name: str, bench: Bench) -> GaussianSequence:
     """Return one of the assets."""
@@ -108,16 +102,15 @@ def asset(name: str, bench: Bench) -> GaussianSequence:
     if bench.made is not None and (bench.made / f"{name}.usdc").is_file():
         return read(bench.made / f"{name}.usdc")
     capture = capture_of(name)
-    mesh, frame = read_truth_mesh(capture, 0), 0
-    views = [entry.view() for entry in capture.select(split="train", frames={frame})]
-    bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), bench.count)
-    colored = colored_by_views(bare, views, options=SHARP, device=str(bench.device))
+    colored, _ = surface_of_capture(capture, 0, bench.count, options=SHARP, device=str(bench.device))
     assert colored.radiance is not None
-    scene = Scene.from_gaussians(bare, str(bench.device))
-    openness = ambient_occlusion(scene, bare.positions, bare.normals, sample_count=64).visibility
-    cloud = bare.with_arrays(
+    scene = Scene.from_gaussians(colored, str(bench.device))
+    openness = ambient_occlusion(scene, colored.positions, colored.normals, sample_count=64).visibility
+    cloud = colored.with_arrays(
+        radiance=None,
+        radiance_color_space=None,
         base_color=np.clip(0.5 + SH_C0 * colored.radiance[:, 0], 0.0, 1.0),
-        roughness=np.full(len(bare), 0.5, np.float32),
+        roughness=np.full(len(colored), 0.5, np.float32),
         ambient_occlusion=np.clip(np.asarray(openness), 0.0, 1.0),
     )
     return GaussianSequence.from_clouds([cloud], metadata=SHARP.as_metadata())
@@ -248,7 +241,7 @@ def sizes(bench: Bench) -> Iterator[Row]:
                     rows.append(row | contend(functools.partial(keep, place=place), reducer, cloud, count, judge))
                 except (npm_packages.MissingPackagesError, subprocess.SubprocessError) as error:
                     rows.append(row | {"absent": str(error)})
-                bench.say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
+                say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
                 yield {"rows": rows, "height": bench.options.height, "tests": bench.tests}
 
 
@@ -297,7 +290,7 @@ def certified(bench: Bench) -> Iterator[Row]:
             stated = found.certificate
             within = float(np.mean(errors <= stated.bound))
             rows[-1] |= {"bound": stated.bound, "share_stated": stated.share, "within": within, "pairs": FRESH_PAIRS}
-            bench.say(str(rows[-1]))
+            say(str(rows[-1]))
             yield {"rows": rows}
 
 
@@ -305,13 +298,9 @@ PARTS = {"certified": certified, "sizes": sizes}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the figure, small, a few steps")
-    parser.add_argument("--device", default="cpu", help="cpu, cuda:0, …")
-    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=[], help="measure these only")
+    parser = record.parser(__doc__, device="cpu", quick="the figure, small, a few steps", parts=PARTS)
     parser.add_argument("--made", type=Path, metavar="FOLDER", help="assets of captures, and what rivals made of them")
     parser.add_argument("--assets", nargs="+", default=["figure", *CAPTURES], metavar="NAME")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     count, height, tests, views, steps = (140_000, 512, 100, 48, 1000) if device.is_cuda else (3_000, 56, 12, 20, 80)
@@ -321,7 +310,7 @@ def main() -> int:
     shares = (0.2,) if arguments.quick else (0.2, 0.1)
     bench = Bench(count, shares, tests, options, tuple(arguments.assets), arguments.made, device)
     keep = functools.partial(record.write_result, arguments, device)
-    result = parts.measure(PARTS, bench, only=arguments.parts, keep=keep)
+    result = measure(PARTS, bench, only=arguments.parts, keep=keep)
     keep(result)
     return 1 if result["failed"] else 0
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from materials_truth import SHARP, true_cloud
+from materials_truth import true_cloud
 from numpy.typing import NDArray
-from parts import Row
+from parts import Row, say
 from relight_scenes import Bench, seconds_of
 from scipy.spatial import cKDTree
 from timing import spread
@@ -32,7 +32,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
 from beam_warp.render.path import PathOptions, PathProgress, PathRenderer
-from beam_warp.study.true_surface import gaussians_on_mesh
+from beam_warp.study.true_surface import SHARP, gaussians_on_mesh
 from beam_warp.trace.mesh_paths import TracedMesh, trace_radiance
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
@@ -107,7 +107,7 @@ def measure_accuracy(bench: Bench) -> Iterator[Row]:
         for light in subject.lights:
             row["lights"][light] = found = measure_light(bench, subject, light, pictures)
             for entry in found["rows"]:
-                bench.say(f"{subject.name}, {light}, {described(entry)}")
+                say(f"{subject.name}, {light}, {described(entry)}")
             yield result
         if bench.pictures is not None:
             bench.pictures.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,7 @@ def subjects(bench: Bench) -> Iterator[RelitSubject]:
         frame = truth_frames(capture)[0]
         started = time.perf_counter()
         cloud = true_cloud(capture, frame, bench.effort.perfect_gaussians, bench.device)
-        bench.say(f"{name}: true materials of {len(cloud):,} Gaussians in {time.perf_counter() - started:.1f} s")
+        say(f"{name}: true materials of {len(cloud):,} Gaussians in {time.perf_counter() - started:.1f} s")
         yield captured_subject(name, capture, frame, cloud, SHARP, bench.effort.views)
     yield demo_subject(bench)
 
@@ -158,7 +158,7 @@ def measure_shadows(bench: Bench) -> Iterator[Row]:
                 images = [renderer.draw(shot_of(subject, light, camera)) for camera in subject.cameras]
                 score = float(np.mean([box_psnr(*pair) for pair in zip(images, truth, strict=True)]))
                 rows.append({"shadows": shadows, "bounces": bounces, "psnr": score})
-            bench.say(f"{name}, {light}: {', '.join(format(entry['psnr'], '.2f') for entry in rows)}")
+            say(f"{name}, {light}: {', '.join(format(entry['psnr'], '.2f') for entry in rows)}")
             yield result
 
 
@@ -222,7 +222,7 @@ def demo_subject(bench: Bench) -> RelitSubject:
             for c in cameras
         ]
         truth[name] = [Known(image.rgb, image.alpha) for image in images]
-    bench.say(f"demo figure: {len(cloud):,} Gaussians, truth of {effort.truth_samples} paths a pixel")
+    say(f"demo figure: {len(cloud):,} Gaussians, truth of {effort.truth_samples} paths a pixel")
     return RelitSubject("demo figure", cloud, SHARP, cameras, lights, truth)
 
 

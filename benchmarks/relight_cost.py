@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from device_memory import peak_memory
-from parts import Row
+from parts import Row, say
 from relight_scenes import LAMPS, SUN_AND_LAMP, Bench, MovingFigure, frame_times, ground, posed, seconds_of
 from timing import spread
 
@@ -81,7 +81,7 @@ def measure_deferred(bench: Bench) -> Iterator[Row]:
         }
         result["cases"][name] = row
         shares = ", ".join(f"{part} {ms:.3f}" for part, ms in row["shares_ms"].items())
-        bench.say(f"{name}: {whole:.3f} ms ({shares}), moving {row['moving']['ms']['median']:.3f} ms")
+        say(f"{name}: {whole:.3f} ms ({shares}), moving {row['moving']['ms']['median']:.3f} ms")
         yield result
 
 
@@ -133,7 +133,7 @@ def measure_path(bench: Bench) -> Iterator[Row]:
             **memory,
         }
         result["cases"][name] = row
-        bench.say(f"{name}: {np.median(rate) / 1e6:.2f} Msample/s, covered {covered:.0%}")
+        say(f"{name}: {np.median(rate) / 1e6:.2f} Msample/s, covered {covered:.0%}")
         yield result
 
 
@@ -147,7 +147,7 @@ def measure_moving(bench: Bench) -> Iterator[Row]:
     scenes["fast"] = Scene.from_gaussians(shot.cloud, str(device), build="fast")
     for tree, scene in scenes.items():
         result["trees"][tree] = frame_times(lambda s=scene, t=tree: s.move(*moving.arrays(), tree=t), effort, device)
-        bench.say(f"hierarchy, {tree}: {result['trees'][tree]['ms']['median']:.3f} ms")
+        say(f"hierarchy, {tree}: {result['trees'][tree]['ms']['median']:.3f} ms")
         yield result
     for name, (options, lights) in deferred_cases(bench).items():
         frame = DeferredRenderer(options, device=str(device)).frame(replace(shot, lights=lights))
@@ -165,12 +165,12 @@ def measure_moving(bench: Bench) -> Iterator[Row]:
 
             row[tree] = frame_times(whole, effort, device)
         result["cases"][name] = row
-        bench.say(
+        say(
             f"moving, {name}: refit {row['refit']['ms']['median']:.3f} ms, rebuilt {row['fast']['ms']['median']:.3f} ms"
         )
         yield result
     result["path_start_ms"] = path_start_times(bench, shot)
-    bench.say(f"path tracer, a new frame made ready: {result['path_start_ms']['median']:.1f} ms")
+    say(f"path tracer, a new frame made ready: {result['path_start_ms']['median']:.1f} ms")
     yield result
 
 

@@ -15,7 +15,7 @@ import raster_scenes
 import scipy.stats
 import trimesh
 from numpy.typing import NDArray
-from parts import Row
+from parts import Row, say
 from relight_scenes import LAMPS, Bench, ground
 
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
@@ -73,7 +73,7 @@ def measure_furnace(bench: Bench) -> Iterator[Row]:
                 }
                 result["rows"].append(row)
             errors = [f"{100.0 * row['mean_error']:+.2f} %" for row in result["rows"][-len(ROUGHNESS) :]]
-            bench.say(f"{shape}, {name}: {', '.join(errors)}")
+            say(f"{shape}, {name}: {', '.join(errors)}")
             yield result
 
 
@@ -128,12 +128,10 @@ def measure_consistent(bench: Bench) -> Iterator[Row]:
             images.append(renderer.draw(shot).rgb.mean(axis=-1, dtype=np.float64))
         means.append(np.mean(images, axis=0))
         variances.append(np.var(images, axis=0, ddof=1) / seeds)
-        bench.say(f"{seeds} images of {samples} samples")
+        say(f"{seeds} images of {samples} samples")
     result = z_scores(means, variances, effort.bias_seeds)
     result |= {"size": list(effort.bias_size), "samples": [FEW_SAMPLES, FEW_SAMPLES * MORE], "seeds": effort.bias_seeds}
-    bench.say(
-        f"z-scores: mean {result['mean']:+.3f}, largest {result['largest']:.2f}, beyond 3: {result['beyond']:.4f}"
-    )
+    say(f"z-scores: mean {result['mean']:+.3f}, largest {result['largest']:.2f}, beyond 3: {result['beyond']:.4f}")
     yield result
 
 

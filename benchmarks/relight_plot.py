@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,16 +19,11 @@ SHOWN_LIGHT = "sunrise"
 GAIN = 4.0
 """Factor by which differences are brightened."""
 
-LARGEST_FILE = 150_000
-"""Largest size of a picture [byte]: it lies in the repository."""
-
-RESOLUTIONS = (130, 115, 100, 90, 80, 70, 60, 50)
-"""Dots per inch, tried one after the other."""
-
 
 def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> None:
     """Draw deferred, path traced, truth and what the first two differ by, a row a subject."""
-    plt = _pyplot()
+    from matplotlib import pyplot as plt
+
     loaded = []
     for name, subject in subjects.items():
         light = SHOWN_LIGHT if SHOWN_LIGHT in subject["lights"] else list(subject["lights"])[-1]
@@ -55,33 +49,10 @@ def draw_comparison(subjects: Mapping[str, Row], pictures: Path, path: Path) -> 
             axis.set_axis_off()
             axis.imshow(image, interpolation="none")
             axis.set_title(caption, fontsize=7)
-    save_small(figure, path)
+    figure.savefig(path, dpi=70)
     plt.close(figure)
 
 
 def shown_color(image: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Return scene-linear radiance, multiplied by alpha, on black as it is compared: sRGB in [0, 1]."""
     return linear_to_srgb(np.clip(image.astype(np.float64), 0.0, 1.0))
-
-
-def save_small(figure: Any, path: Path) -> None:
-    """Write a figure with a palette, at the best resolution that keeps the file below `LARGEST_FILE`."""
-    from PIL import Image
-
-    for resolution in RESOLUTIONS:
-        drawn, packed = io.BytesIO(), io.BytesIO()
-        figure.savefig(drawn, dpi=resolution)
-        with Image.open(drawn) as picture:
-            picture.convert("RGB").quantize(256).save(packed, format="PNG", optimize=True)
-        if packed.tell() <= LARGEST_FILE:
-            break
-    path.write_bytes(packed.getvalue())
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot

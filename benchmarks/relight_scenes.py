@@ -161,7 +161,6 @@ class Bench:
         effort: How much is measured.
         device: Where.
         pictures: Folder of images that ``tables.py`` draws; None for none.
-        say: Hears what is being done.
     """
 
     captures: Mapping[str, Capture]
@@ -170,7 +169,6 @@ class Bench:
     effort: Effort
     device: Any
     pictures: Path | None
-    say: Callable[[str], None]
 
     def figure(self, *, lights: tuple[Light, ...] = (), mesh: ShotMesh | None = None) -> Shot:
         """Return the figure under the sky: a bumpy ball of radius 1, which covers a quarter of the image."""

@@ -13,7 +13,6 @@ Steps that are made once, and previews, take no time in ``takes``: nobody has me
 
 from __future__ import annotations
 
-import argparse
 import functools
 import json
 import tempfile
@@ -24,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import parts
 import record
+from parts import measure, say
 
 from beam_warp.converters.clips import ClipWork
 from beam_warp.decomposition.frames import ReconstructedFrames
@@ -69,10 +68,6 @@ class Bench:
     count: int = 140_000
     written: int = 90
     nap: float = 0.5
-
-    def say(self, words: str) -> None:
-        """Print a line."""
-        print(words, flush=True)
 
     @functools.cached_property
     def written_frame(self) -> Row:
@@ -211,7 +206,7 @@ def takes(bench: Bench) -> Iterator[Row]:
                     "efficiency_written_by_one": work / (workers * alone),
                 }
             )
-            bench.say(json.dumps(rows[-1]))
+            say(json.dumps(rows[-1]))
             yield {"frames": bench.frames, "rows": rows}
 
 
@@ -271,7 +266,7 @@ def check(bench: Bench) -> Iterator[Row]:
                 "simulated_efficiency": work / (workers * simulated(steps, (), naps, workers)),
             }
         )
-        bench.say(json.dumps(rows[-1]))
+        say(json.dumps(rows[-1]))
         yield {"rows": rows}
 
 
@@ -280,14 +275,11 @@ PARTS = {"constants": constants, "takes": takes, "check": check}
 
 def main() -> None:
     """Measure, and write the result after every part."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="smaller, to see whether it runs")
-    parser.add_argument("--parts", nargs="+", choices=tuple(PARTS), default=())
-    record.add_arguments(parser)
+    parser = record.parser(__doc__, quick="smaller, to see whether it runs", parts=PARTS)
     arguments = parser.parse_args()
     bench = Bench(frames=600, count=2000, written=70, nap=0.01) if arguments.quick else Bench()
     keep = functools.partial(record.write_result, arguments, resolve_device("cpu"))
-    parts.measure(PARTS, bench, only=arguments.parts, keep=keep)
+    measure(PARTS, bench, only=arguments.parts, keep=keep)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ flicker.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import tempfile
 from collections.abc import Iterator
@@ -22,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import parts
 import record
 from numpy.typing import NDArray
+from parts import measure, say
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import write_demo_capture
@@ -66,10 +65,6 @@ class Bench:
     samples: int
     steps: FitAndTrack
     device: str | None
-
-    def say(self, words: str) -> None:
-        """Print a line."""
-        print(words, flush=True)
 
 
 def errors(capture: Capture, sequence: GaussianSequence, steps: FitAndTrack) -> list[list[NDArray[np.float64]]]:
@@ -120,16 +115,13 @@ def flicker(bench: Bench) -> Iterator[Row]:
                 "psnr": made.report["mean_psnr"],
                 "segments": made.report["segments"],
             }
-            bench.say(str(result[label]))
+            say(str(result[label]))
             yield result
 
 
 def main() -> None:
     """Measure, and write the result."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small and few steps, to see whether it runs")
-    parser.add_argument("--device", default=None)
-    record.add_arguments(parser)
+    parser = record.parser(__doc__, device=None, quick="small and few steps, to see whether it runs")
     arguments = parser.parse_args()
     device = arguments.device
     if arguments.quick:
@@ -138,7 +130,7 @@ def main() -> None:
     else:
         bench = Bench(8, 2, 256, 16, 64, FitAndTrack(fitting=FitOptions(gaussian_count=20_000), device=device), device)
     keep = functools.partial(record.write_result, arguments, resolve_device(device))
-    parts.measure({"flicker": flicker}, bench, keep=keep)
+    measure({"flicker": flicker}, bench, keep=keep)
 
 
 if __name__ == "__main__":

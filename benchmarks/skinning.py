@@ -9,7 +9,6 @@ no tracking can undo. How much of independent errors of the joints' places reach
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -123,11 +122,9 @@ def carried(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = record.parser(__doc__, device=None)
     parser.add_argument("--capture", default="walker")
     parser.add_argument("--skins", type=int, default=40_000)
-    parser.add_argument("--device", default=None)
-    record.add_arguments(parser)
     options = parser.parse_args()
     folder = Path(os.environ.get("BEAM_DATA", "../shared/data")) / "captures" / options.capture
     device = resolve_device(options.device)

@@ -262,25 +262,25 @@ def light_turn(result: Row) -> Rows:
     return rows
 
 
-@figure("materials_perfect.png", PERFECT)
+@figure("materials_perfect.webp", PERFECT)
 def draw_perfect(result: Row, path: Path) -> None:
     """Draw `perfect` and `light`, with every way to sample."""
     materials_plot.draw_perfect(result["perfect"], path)
 
 
-@figure("materials_ablation.png", ABLATION)
+@figure("materials_ablation.webp", ABLATION)
 def draw_ablation(result: Row, path: Path) -> None:
     """Draw `ladder` and `alone`."""
     materials_plot.draw_ablation(result["ablation"], path)
 
 
-@figure("materials_cost.png", COST)
+@figure("materials_cost.webp", COST)
 def draw_cost(result: Row, path: Path) -> None:
     """Draw `cost`, stage by stage."""
     materials_plot.draw_cost(result["cost"], path)
 
 
-@figure("materials_runner.png", EVALUATION)
+@figure("materials_runner.webp", EVALUATION)
 def draw_runner(result: Row, path: Path) -> None:
     """Show the runner's materials beside the truth."""
     materials_plot.draw_sheet(PICTURES / "materials_runner.png", path)

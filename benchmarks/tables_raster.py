@@ -110,13 +110,13 @@ def compositing_share(result: Row) -> str:
     return " and ".join(f"{100.0 * share:.0f} %" for share in shares)
 
 
-@figure("raster_growth.png", H200)
+@figure("raster_growth.webp", H200)
 def growth(result: Any, path: Path) -> None:
     """Draw time over Gaussians and over pixels."""
     draw_growth([result], path)
 
 
-@figure("raster_stages.png", H200, CPU)
+@figure("raster_stages.webp", H200, CPU)
 def stages(result: Any, on_cpu: Any, path: Path) -> None:
     """Draw the stages of a frame."""
     draw_stages([result, on_cpu], path)

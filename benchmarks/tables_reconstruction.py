@@ -178,12 +178,9 @@ def exposures(result: Row) -> Rows:
     return found
 
 
-@figure("reconstruction.png", MAIN, CHOICES)
+@figure("reconstruction.webp", MAIN, CHOICES)
 def draw(main: Row, choices: Row, path: Path) -> None:
     """Draw quality over Gaussians and over cameras, and drift over frames."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     ours = choices["rade"]["rows"][-1]

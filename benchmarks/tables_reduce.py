@@ -36,7 +36,7 @@ def sizes(result: Row) -> Rows:
     return rows
 
 
-@figure("reducing.png", REDUCE)
+@figure("reducing.webp", REDUCE)
 def draw_sizes(result: Row, path: Path) -> None:
     """Show the PSNR of every contender by asset: bare as outlines, refitted as bars."""
     import matplotlib.pyplot as plt

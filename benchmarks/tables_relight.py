@@ -173,7 +173,7 @@ def results_accuracy(true: Row, evaluated: Row) -> Rows:
     ]
 
 
-@figure("relight_comparison.png", ACCURACY)
+@figure("relight_comparison.webp", ACCURACY)
 def draw_comparison(result: Row, path: Path) -> None:
     """Show deferred, path traced and truth of every capture."""
     subjects = result["accuracy"]["subjects"]

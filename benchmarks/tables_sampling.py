@@ -93,12 +93,9 @@ def sampling_bias(ball: Row, human: Row) -> float:
     )
 
 
-@figure("estimators.png", BALL_AND_FIGURE[0])
+@figure("estimators.webp", BALL_AND_FIGURE[0])
 def estimators(result: Row, path: Path) -> None:
     """Draw error against rays, both logarithmic: one panel for occlusion, one a sky."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     counts = result["curve_counts"]
@@ -122,7 +119,7 @@ def estimators(result: Row, path: Path) -> None:
     plt.close(drawing)
 
 
-@figure("chart_tracing.png", "chart_tracing_cpu.json")
+@figure("chart_tracing.webp", "chart_tracing_cpu.json")
 def chart_tracing(result: Row, path: Path) -> None:
     """Draw what the command draws."""
     with tempfile.TemporaryDirectory() as folder:

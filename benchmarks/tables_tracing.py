@@ -103,7 +103,7 @@ def _nanoseconds(result: Row, overlap: float) -> float:
     return row["contenders"]["wide product"]["nanoseconds_per_ray"]["median"]
 
 
-@figure("tracing_growth_h200.png", "tracing_h200.json")
+@figure("tracing_growth_h200.webp", "tracing_h200.json")
 def tracing_growth(result: Row, path: Path) -> None:
     """Draw the growth rows."""
     draw_growth(dict(result), path)

@@ -8,7 +8,6 @@ The result is written after every run.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import functools
 import io
@@ -108,11 +107,9 @@ def measured(case: tuple[str, str, float], factor: float, words: list[str], out:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device")
+    parser = record.parser(__doc__, device=None)
     parser.add_argument("--runs", type=int, default=40, metavar="N")
     parser.add_argument("--seed", type=int, default=0)
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     keep = functools.partial(record.write_result, arguments, device)

@@ -10,19 +10,19 @@ some of the same rays. Embree needs ``pip install embreex`` and gcc; without the
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
-import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import record
 import warp as wp
 from numpy.typing import NDArray
+from parts import measure, once
 from timing import Task, Times, spread, take_turns
 from tracing_baselines import (
     BUILD_QUALITIES,
@@ -231,9 +231,9 @@ def truth_for(cloud: GaussianCloud, rays: Rays, found: NDArray[np.float64], coun
     transmittances of all rays, tells the others.
     """
     even = np.linspace(0, len(found) - 1, -(-count // 2)).astype(np.int64)
-    partial = np.flatnonzero((found > 1e-3) & (found < 1.0))
-    partial = partial[np.linspace(0, len(partial) - 1, min(count // 2, len(partial))).astype(np.int64)]
-    rows = np.union1d(even, partial)
+    partly = np.flatnonzero((found > 1e-3) & (found < 1.0))
+    partly = partly[np.linspace(0, len(partly) - 1, min(count // 2, len(partly))).astype(np.int64)]
+    rows = np.union1d(even, partly)
     return Truth(rows, brute_force_visibility(cloud, Rays(rays.origins[rows], rays.directions[rows])))
 
 
@@ -497,37 +497,24 @@ def measure_parity(effort: Effort, device: Any) -> dict[str, Any] | None:
     }
 
 
-SECTIONS: dict[str, Callable[[Effort, Any], Any]] = {
-    "torus": measure_torus,
-    "builds": measure_builds,
-    "closest_surface": measure_closest_surface,
-    "parity": measure_parity,
-    "growth": measure_growth,
-}
-
-
-def measure(effort: Effort, device: Any, write: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Measure every section, and write after each; one that fails is named under ``failed``."""
-    result: dict[str, Any] = {"failed": {}}
-    for name, section in SECTIONS.items():
-        print(name, file=sys.stderr, flush=True)
-        try:
-            result[name] = section(effort, device)
-        except Exception:
-            result["failed"][name] = traceback.format_exc(limit=-3)
-        write(result)
-    return result
+def sections(effort: Effort) -> dict[str, Callable[[Any], Iterator[Any]]]:
+    """Return what is measured, by name; each takes a device."""
+    found: dict[str, Callable[[Effort, Any], Any]] = {
+        "torus": measure_torus,
+        "builds": measure_builds,
+        "closest_surface": measure_closest_surface,
+        "parity": measure_parity,
+        "growth": measure_growth,
+    }
+    return {name: once(partial(section, effort)) for name, section in found.items()}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    record.add_arguments(parser)
-    parser.add_argument("--quick", action="store_true", help="fewer rays and repeats")
+    parser = record.parser(__doc__, device="cpu", quick="fewer rays and repeats")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     effort = QUICK if arguments.quick else ON_CUDA if device.is_cuda else ON_CPU
-    result = measure(effort, device, lambda found: record.write_result(arguments, device, found))
+    result = measure(sections(effort), device, keep=partial(record.write_result, arguments, device))
     return 1 if result["failed"] else 0
 
 

@@ -23,9 +23,6 @@ def draw_growth(result: dict[str, Any], path: Path) -> None:
         result: What ``tracing.py`` writes as JSON; its ``growth`` holds the rows, with overlaps and opacities.
         path: PNG to write.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     rows = result["growth"]
@@ -76,14 +73,14 @@ def _draw(axes: Any, rows: list[dict[str, Any]], key: str, group: str, value: Ca
         )
     axes.set(xscale="log", yscale="log")
     plain = FuncFormatter(lambda number, _: f"{number:,.6g}" if number >= 1e-3 else f"{number:.0e}")
-    axes.set_xticks(x, [_short(number) for number in x])
+    axes.set_xticks(x, [short_number(number) for number in x])
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(plain)
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def _short(number: float) -> str:
+def short_number(number: float) -> str:
     """Return 140000 as 140k and 4000000 as 4M."""
     for unit, letter in ((1e6, "M"), (1e3, "k")):
         if number >= unit:

@@ -1,6 +1,6 @@
 """Our files in viewers of the web: whether they stand upright and unmirrored there, and how they look.
 
-    python benchmarks/viewers.py --out result.json --picture docs/images/viewers.png
+    python benchmarks/viewers.py --out result.json --picture docs/images/viewers.webp
 
 The probe, the pages and their camera are those of ``tests/web``. The viewers come from npm (`npm_packages.py`), the
 browser is a headless Chromium that draws in software.
@@ -8,7 +8,6 @@ browser is a headless Chromium that draws in software.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -28,9 +27,6 @@ from web.viewers import VIEWERS, Viewer, chromium, photograph, write_probe
 
 from beam_warp.image.panels import lay_out
 
-COLORS = 255
-"""Colours of the picture's palette: PNG takes a third of the bytes then."""
-
 
 def look(browser: Any, viewer: Viewer, ending: str, folder: Path) -> tuple[dict[str, Any], NDArray[np.uint8]]:
     """Return what is found in a viewer's picture of the probe, and the picture."""
@@ -48,9 +44,8 @@ def look(browser: Any, viewer: Viewer, ending: str, folder: Path) -> tuple[dict[
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--picture", type=Path, metavar="PNG", help="all screenshots in one picture")
-    record.add_arguments(parser)
+    parser = record.parser(__doc__)
+    parser.add_argument("--picture", type=Path, metavar="WEBP", help="all screenshots in one picture")
     args = parser.parse_args()
     rows, panels = [], []
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
@@ -68,8 +63,7 @@ def main() -> int:
         }
     record.write_result(args, wp.get_device("cpu"), result)
     if args.picture:
-        sheet = Image.fromarray(lay_out(panels, columns=5)).quantize(COLORS, dither=Image.Dither.NONE)
-        sheet.save(args.picture, optimize=True)
+        Image.fromarray(lay_out(panels, columns=5)).save(args.picture, quality=85, method=6)
     return 0
 
 

@@ -237,8 +237,7 @@ def measure(backend: str, path: Path, arguments: argparse.Namespace) -> dict[str
 
 def main() -> int:
     """Make the take, measure, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    record.add_arguments(parser)
+    parser = record.parser(__doc__)
     parser.add_argument("--gaussians", type=int, default=100_000)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--minutes", type=float, default=5.0)

@@ -11,7 +11,6 @@ bytes. Cameras, masks and exposures are kept, for they are looked at once in a t
 
 from __future__ import annotations
 
-import argparse
 import functools
 import json
 import os
@@ -26,8 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import parts
 import record
+from parts import measure, say
 
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, dome_cameras, write_capture
 from beam_warp.demo.lights import studio
@@ -67,10 +66,6 @@ class Bench:
     gaussians: int = 140_000
     more: tuple[str, ...] = ()
     place: Path = field(default_factory=Path)
-
-    def say(self, words: str) -> None:
-        """Print a line."""
-        print(words, flush=True)
 
     def capture(self, name: str, cameras: int, width: int, height: int, frames: int) -> Path:
         """Path trace a capture, and name its moments over and over."""
@@ -129,9 +124,9 @@ def take(bench: Bench) -> Iterator[Row]:
     """Work on the take in each way, and compare."""
     began = time.perf_counter()
     capture = bench.capture("take", bench.cameras, bench.width, bench.height, bench.frames)
-    bench.say(f"capture: {time.perf_counter() - began:.1f} s")
+    say(f"capture: {time.perf_counter() - began:.1f} s")
     bench.run(bench.capture("warm", 8, 128, 128, 2), "1", 2000)
-    bench.say(f"warm: {time.perf_counter() - began:.1f} s")
+    say(f"warm: {time.perf_counter() - began:.1f} s")
     rows: list[Row] = []
     first: dict[str, bytes] = {}
     for workers in bench.workers:
@@ -142,20 +137,18 @@ def take(bench: Bench) -> Iterator[Row]:
             row["differing_files"] = sorted(k for k in first.keys() | made.keys() if first.get(k) != made.get(k))
         first = first or made
         rows.append(row)
-        bench.say(json.dumps(row))
+        say(json.dumps(row))
         size = {"frames": bench.frames, "segment": bench.segment, "cameras": bench.cameras}
         yield {**size, "width": bench.width, "height": bench.height, "gaussians": bench.gaussians, "rows": rows}
 
 
 def main() -> None:
     """Measure, and write the result after every run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small images, to see whether it runs")
+    parser = record.parser(__doc__, quick="small images, to see whether it runs")
     parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--segment-length", type=int, default=3)
     parser.add_argument("--drawn", type=int, default=2, help="moments that are path traced")
     parser.add_argument("--workers", nargs="+", default=["1", "gpus"], help="as beam run has it, one run each")
-    record.add_arguments(parser)
     arguments = parser.parse_args()
     bench = Bench(arguments.frames, arguments.segment_length, arguments.drawn, tuple(arguments.workers))
     if arguments.quick:
@@ -164,7 +157,7 @@ def main() -> None:
     keep = functools.partial(record.write_result, arguments, resolve_device(None))
     with tempfile.TemporaryDirectory() as name:
         bench.place = Path(name)
-        parts.measure({"take": take}, bench, keep=keep)
+        measure({"take": take}, bench, keep=keep)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draw docs/images/architecture.png: the packages on their floors, and the way of the data.
+"""Draw docs/images/architecture.webp: the packages on their floors, and the way of the data.
 
 The floors are those of `tests/test_layers.py`, the arrows are the imports of the source. Run it after a package or an
 arrow between packages is added or removed; `tests/test_architecture.py` says when.
@@ -22,14 +22,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.path import Path as Curve
-from PIL import Image, PngImagePlugin
+from PIL import Image
 from scipy.optimize import isotonic_regression
 
 ROOT = Path(__file__).parent.parent
-PICTURE = ROOT / "docs" / "images" / "architecture.png"
-
-DATA = "PackageArrows"
-"""Key of the PNG's text that holds what the picture was drawn from."""
+PICTURE = ROOT / "docs" / "images" / "architecture.webp"
 
 WIDTH, FLOORS_HEIGHT, WAY_HEIGHT = 12.0, 9.3, 4.1
 """Size of the picture and of its two parts [inch]."""
@@ -280,7 +277,7 @@ def _color(package: str) -> str:
 
 
 def draw(path: Path, packages: Packages) -> None:
-    """Write the picture, with what it was drawn from as a text in the PNG."""
+    """Write the picture as WebP, with what it was drawn from as its XMP."""
     total = FLOORS_HEIGHT + WAY_HEIGHT
     figure = Figure(figsize=(WIDTH, total), facecolor="white")
     FigureCanvasAgg(figure)
@@ -307,10 +304,8 @@ def draw(path: Path, packages: Packages) -> None:
     draw_way(way)
     with io.BytesIO() as drawn:
         figure.savefig(drawn, dpi=RESOLUTION)
-        few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)  # a third of the bytes
-    about = PngImagePlugin.PngInfo()
-    about.add_text(DATA, packages.data())
-    few.save(path, pnginfo=about, optimize=True)
+        few = Image.open(drawn).convert("RGB").quantize(64, dither=Image.Dither.NONE)  # half of the bytes
+    few.convert("RGB").save(path, "WEBP", lossless=True, quality=60, xmp=packages.data().encode())
 
 
 if __name__ == "__main__":

@@ -82,7 +82,7 @@ def help_page() -> str:
     """Return the help of every command, all options, as one page."""
     from beam_warp.cli import convert, main, validate
 
-    charts = [("chart", study) for study in ("tracing", "materials")]
+    charts = [("chart", study) for study in ("tracing", "materials", "reconstruct", "render", "delivery", "all")]
     words = [*((word,) for word in main.COMMANDS if word != "chart"), *charts]
     calls = [
         ("beam", main.main, ["--help"]),

@@ -16,11 +16,11 @@ from tyro.conf import Positional, arg
 from beam_warp import __version__, converters
 from beam_warp.checks import require_path
 from beam_warp.cli.common.console import escaped, options_named, print_json, print_notes, progress, run_command
-from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of
+from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of, options_of
 from beam_warp.cli.common.pages import parse
 from beam_warp.cli.common.paths import paths_checked
 from beam_warp.converters.common.importers import IMPORTERS
-from beam_warp.converters.common.options import Activation, MaterialActivation, Profile
+from beam_warp.converters.common.options import Activation, MaterialActivation, Profile, ReadOptions
 from beam_warp.converters.delivery.writer import delivered
 from beam_warp.converters.formats import FORMATS, format_of
 from beam_warp.converters.frame_files import written_axes
@@ -114,28 +114,8 @@ def _require_apart(source: Path, output: Path, frame_count: int) -> None:
         )
 
 
-def _options(command: ConvertCommand) -> converters.WriteOptions:
-    return converters.WriteOptions(
-        target=command.target,
-        axes=command.axes,
-        profile=command.profile,
-        sh_degree=command.sh_degree,
-        spz_version=command.spz_version,
-        full_float=command.full_float,
-        lighting_variants=command.lighting_variants,
-        error_scale=command.error_scale,
-    )
-
-
 def _read(command: ConvertCommand) -> GaussianSequence:
-    return converters.read(
-        command.input,
-        source_axes=command.source_axes,
-        meters_per_unit=command.meters_per_unit,
-        material_activation=command.material_activation,
-        activation=command.activation,
-        drop_invalid=command.drop_invalid,
-    )
+    return converters.read(command.input, **vars(options_of(command, ReadOptions)))
 
 
 def _write(command: ConvertCommand, sequence: GaussianSequence, path: Path) -> list[Path]:
@@ -146,13 +126,17 @@ def _write(command: ConvertCommand, sequence: GaussianSequence, path: Path) -> l
             report("convert", frame + 1, len(sequence))
             return cloud
 
-        return converters.write(dataclasses.replace(sequence, read_frame=read_and_report), path, _options(command))
+        return converters.write(
+            dataclasses.replace(sequence, read_frame=read_and_report),
+            path,
+            options_of(command, converters.WriteOptions),
+        )
 
 
 def convert(command: ConvertCommand) -> int:
     """Read, write, and say what was done."""
     started = time.perf_counter()
-    options = _options(command)
+    options = options_of(command, converters.WriteOptions)
     if command.player:
         from beam_warp.cli.player import publish  # its lights wait for SciPy
 

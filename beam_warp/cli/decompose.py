@@ -252,8 +252,8 @@ def run_options(
         InvalidOptionError: A texture comes without its mesh, or a mesh without its texture.
     """
     from beam_warp.decomposition.job import RunOptions
-    from beam_warp.materials.direct import MaterialOptions
     from beam_warp.materials.images import ImagePathOptions
+    from beam_warp.materials.light_rays import MaterialOptions
     from beam_warp.materials.roughness_source import RoughnessTexture
 
     stated = measuring.roughness

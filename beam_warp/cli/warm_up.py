@@ -64,7 +64,7 @@ def _work(folder: Path, device: str) -> None:
     from beam_warp.decomposition.options import ESTIMATE, RunOptions
     from beam_warp.decomposition.work import MaterialWork
     from beam_warp.demo.capture import write_demo_capture
-    from beam_warp.materials.direct import MaterialOptions
+    from beam_warp.materials.light_rays import MaterialOptions
     from beam_warp.reconstruction.fit import FitOptions
     from beam_warp.reconstruction.job import ReconstructionWork
     from beam_warp.reconstruction.steps import FitAndTrack

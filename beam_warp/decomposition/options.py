@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from beam_warp.checks import require_count, require_number
 from beam_warp.errors import InvalidOptionError
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
 from beam_warp.render.sheet import Relighting
 from beam_warp.world.camera import MAX_SIDE

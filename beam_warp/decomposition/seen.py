@@ -12,10 +12,10 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.decomposition.capture_images import CaptureImages
 from beam_warp.jobs.progress import JobLog
 from beam_warp.materials.base_color import fill_from_neighbors
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.light import light_evidence
 from beam_warp.materials.light_fits import LightEvidence
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints, estimate_normals
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud

@@ -40,7 +40,7 @@ from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.bake import BakedValues, BakeOptions, BakeTarget, Solver, bake
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
 from beam_warp.materials.base_color import fill_from_neighbors
-from beam_warp.materials.direct import DIFFUSE_WEIGHTS, DiffuseWeight
+from beam_warp.materials.light_rays import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.materials.residues import (
     FEWEST_LIGHT_SAMPLES,
     SURFACE_DEPTHS,
@@ -84,7 +84,7 @@ class ImagePathOptions:
         steps: Steps of ``"adam"``.
         ridge: See `beam_warp.materials.bake.BakeOptions`.
         temporal: Pull of the base colour towards the previous frame's, in pixels.
-        diffuse_weight: See `beam_warp.materials.direct.DIFFUSE_WEIGHTS`.
+        diffuse_weight: See `beam_warp.materials.light_rays.DIFFUSE_WEIGHTS`.
         surface_depth: See `beam_warp.materials.residues.SURFACE_DEPTHS`.
         seed: Same seed, same device, same bits.
 

@@ -30,7 +30,7 @@ from beam_warp.kernels.materials.pixel_surfaces import (
 )
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.direct import DIFFUSE_WEIGHTS, DiffuseWeight
+from beam_warp.materials.light_rays import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
@@ -141,7 +141,7 @@ def surface_residues(
         light: The environment, prepared on the same device.
         sample_count: Rays a pixel, at least `FEWEST_LIGHT_SAMPLES`.
         offset: Lift of ray origins along the normal [m].
-        diffuse_weight: w_d, one of `beam_warp.materials.direct.DIFFUSE_WEIGHTS`.
+        diffuse_weight: w_d, one of `beam_warp.materials.light_rays.DIFFUSE_WEIGHTS`.
         seed: Same seed, same device, same bits.
         frame: Number of the noise: views and moments of different numbers have independent samples.
 

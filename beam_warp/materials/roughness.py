@@ -36,8 +36,8 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.roughness_profile import PARTS, ProfileFit, launch_lobe_shares, launch_profile
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.direct import MaterialOptions, light_batches, lit_points, mean_radiance
 from beam_warp.materials.evidence import ViewEvidence
+from beam_warp.materials.light_rays import MaterialOptions, light_batches, lit_points, mean_radiance
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.world.curve import morton_order

@@ -25,9 +25,10 @@ from beam_warp.materials.agreement import (
     require_match,
 )
 from beam_warp.materials.base_color import BaseColor, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light import check_light
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.stability.material_cases import MaterialStress, MaterialStudio
 from beam_warp.stability.suite import CaseOutcome, StabilityCase, attempt

@@ -18,25 +18,22 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.study.materials_plan import MaterialsPlan
 from beam_warp.study.materials_truth import COLOR, OCCLUSION, ManyRays, Reference, TrueViews
 from beam_warp.study.table import Interval, Metric, Row, Settings, Study, StudySubject
 from beam_warp.study.tracing import SENTENCES, axes_of, device_name
 from beam_warp.study.tracing_plan import parse_offset
-from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.study.true_surface import SHARP, surface_of_capture
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
-
-SHARP = RasterOptions(antialiased=True, low_pass=0.1)
-"""How Gaussians on a true surface are drawn."""
 
 GAUSSIANS = {False: 4000, True: 60_000}
 """Number of Gaussians on the true surface of a capture that comes without a reconstruction, by whether on CUDA."""
@@ -84,11 +81,8 @@ class MaterialsSubject:
         Raises:
             MissingFileError: The capture has no true surface.
         """
-        mesh = read_truth_mesh(capture, frame)
-        views = [record.view() for record in capture.select(split="train", frames={frame})]
         count = GAUSSIANS[resolve_device(device).is_cuda]
-        bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
-        cloud = colored_by_views(bare, views, options=SHARP, device=device)
+        cloud, views = surface_of_capture(capture, frame, count, options=SHARP, device=device)
         return cls(cloud, views, environment, SHARP, capture, frame, name)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from beam_warp.checks import require_count
 from beam_warp.errors import InvalidOptionError
-from beam_warp.materials.direct import DIFFUSE_WEIGHTS
+from beam_warp.materials.light_rays import DIFFUSE_WEIGHTS
 from beam_warp.study.table import Settings
 from beam_warp.study.tracing_plan import RATIOS, check_levels, parse_offset
 from beam_warp.trace.denoise import DENOISERS

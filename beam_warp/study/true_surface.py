@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from beam_warp.capture.capture import Capture
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_array, require_count
 from beam_warp.device.arrays import resolve_device
@@ -19,11 +20,15 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
+from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.world.curve import morton_order
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.mesh import vertex_normals
 from beam_warp.world.shapes import TiledSurface, tile
+
+SHARP = RasterOptions(antialiased=True, low_pass=0.1)
+"""How Gaussians on a true surface are drawn."""
 
 OPACITY = 0.99
 """Opacity of every Gaussian, the rasteriser's cap of alpha: overlapping neighbours let 0.1 % of the light through."""
@@ -92,6 +97,27 @@ def gaussians_on_mesh(vertices: ArrayLike, faces: ArrayLike, count: int) -> Gaus
     scales = tiles.scales.copy()
     scales[:, 2] = FLATNESS * scales[:, 0]
     return tiles.with_arrays(scales=scales, opacities=np.full(count, OPACITY, np.float32))
+
+
+def surface_of_capture(
+    capture: Capture, frame: int, count: int, *, options: RasterOptions | None = None, device: str | None = None
+) -> tuple[GaussianCloud, list[CapturedView]]:
+    """Return Gaussians on the true surface of a capture's frame, coloured by its photographs, and those.
+
+    Args:
+        capture: With its true surface; the views of its split "train" are read.
+        frame: Number of the frame.
+        count: Number of Gaussians.
+        options: How splats are drawn.
+        device: Warp device; None takes the first CUDA device, or the CPU where there is none.
+
+    Raises:
+        MissingFileError: The capture has no true surface.
+    """
+    mesh = read_truth_mesh(capture, frame)
+    views = [record.view() for record in capture.select(split="train", frames={frame})]
+    bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
+    return colored_by_views(bare, views, options=options, device=device), views
 
 
 def colored_by_views(

@@ -17,8 +17,8 @@ from constants_places import ARGUMENT, changed, is_option, numbers_of, option_pa
 from constants_registry import GROUPS, SIDES, UNTUNED, Constant, untuned_places
 
 from beam_warp.materials.bake import BakeOptions
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.reconstruction import densify, initial, targets
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.job import ReconstructOptions

@@ -64,7 +64,7 @@ def bench(tiny_capture, tmp_path):
     steps = FakeSteps(tiny_capture)
     captures = {"walker": tiny_capture, "robot": tiny_capture}
     make = lambda fitting, tracking: Contender(steps, steps.mesh, fitting.raster)  # noqa: E731
-    return benchmark.Bench(captures, TINY, make, resolve_device("cpu"), lambda text: None, tmp_path / "kept")
+    return benchmark.Bench(captures, TINY, make, resolve_device("cpu"), tmp_path / "kept")
 
 
 class TestCapture:
@@ -120,7 +120,9 @@ class TestSections:
 
     def test_all_sections_run_and_tables_show_them(self, bench, tmp_path):
         kept = []
-        result = benchmark.measure(bench, keep=lambda state: kept.append(json.dumps(state, default=np.ndarray.tolist)))
+        result = benchmark.measure(
+            benchmark.SECTIONS, bench, keep=lambda state: kept.append(json.dumps(state, default=np.ndarray.tolist))
+        )
         assert result["failed"] == []
         assert len(kept) == 2 + 4 + 4 + 6 + 1 + 1 + 1  # after every row
         walker, _ = result["captures"]["rows"]
@@ -140,7 +142,7 @@ class TestSections:
         assert (tmp_path / "chart.png").stat().st_size > 10_000
 
     def test_kept_sequences_say_how_they_are_drawn_and_what_they_show(self, bench):
-        assert benchmark.measure(bench, only=("captures",))["failed"] == []
+        assert benchmark.measure(benchmark.SECTIONS, bench, only=("captures",))["failed"] == []
         sequence = converters.read(bench.keep / "robot" / "gaussians.usda")
         assert sequence.metadata["capture_frames"] == "0 1"
         assert benchmark.RasterOptions.from_metadata(sequence.metadata) == FIT_RASTER
@@ -149,14 +151,6 @@ class TestSections:
             found = change_axes(sequence[index], WORLD_AXES)
             assert np.array_equal(found.positions, known[index].positions)
             assert np.array_equal(found.ids, known[index].ids)
-
-    def test_a_section_that_fails_says_so_and_others_run(self, bench):
-        def refuse(fitting, tracking):
-            raise RuntimeError("no contender")
-
-        result = benchmark.measure(replace(bench, make=refuse), only=("gaussians", "cameras"))
-        assert result["failed"] == ["gaussians", "cameras"]
-        assert result["gaussians"]["failed"] == "RuntimeError: no contender"
 
 
 class TestTrials:

@@ -11,7 +11,6 @@ from materials_truth import SHARP, true_cloud
 from parts import measure
 from relight_accuracy import Known, RelitSubject, box_psnr, materials_at, measure_light, scores
 from relight_energy import z_scores
-from relight_plot import LARGEST_FILE
 from relight_scenes import MovingFigure, posed
 
 from beam_warp import converters
@@ -39,7 +38,7 @@ TINY = replace(
 @pytest.fixture(scope="module")
 def bench(relit_capture):
     def make(device, **changes):
-        made = benchmark.bench_of_capture(relit_capture, resolve_device(device), lambda text: None)
+        made = benchmark.bench_of_capture(relit_capture, resolve_device(device))
         return replace(made, sky=made.sky.resized(16, 32), effort=TINY, **changes)
 
     return make
@@ -207,7 +206,7 @@ def test_all_of_it_runs_into_tables(device, bench, tmp_path, small_lights, relit
     assert [(row[0], row[4:]) for row in scored[3:]] == 2 * [("demo figure", ["", ""])]  # no capture was decomposed
     monkeypatch.setattr(tables_relight, "PICTURES", pictures)
     tables_relight.draw_comparison(result, tmp_path / "figure.png")
-    assert 1000 < (tmp_path / "figure.png").stat().st_size <= LARGEST_FILE
+    assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
 def test_shadow_maps_are_scored_of_assets_alone(bench):

@@ -95,6 +95,9 @@ class TestStaleness:
         record._digest_of_file.cache_clear()
         assert record.changed_since({"code": code}) == ["kept.py", "gone.py"]
         assert record.changed_since({"code": {}}) == []
+        inside = {f"somewhere/{place}": digest for place, digest in code.items()}
+        assert record.changed_since({"code": record.by_folder(inside)}) == list(inside)
+        assert record.by_folder({"a/b.py": "1", "a/c.py": "2"}) == {"a": "b:1 c:2"}
 
     def test_loaded_code_has_paths_of_the_repository(self):
         import beam_warp.world.camera  # noqa: F401

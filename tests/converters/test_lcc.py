@@ -186,19 +186,19 @@ def test_leaves_are_read(tree):
     assert sequence.metadata["notes"] == "the leaves are read, the finest of its levels"
 
 
-def test_a_region_may_end_in_a_coarser_leaf(tree):
+@pytest.mark.parametrize(
+    ("change", "left"),
+    [
+        (lambda region: region.pop("child"), lambda rows: rows[:: write_lcc.COARSER]),
+        (lambda region: region["child"].pop("0"), lambda rows: rows[len(rows) // 2 :]),
+    ],
+    ids=["a region that ends in a coarser leaf", "part of a file"],
+)
+def test_what_the_tree_names_is_read(tree, change, left):
     path, cloud = tree
     first, *others = write_lcc.regions(cloud)
-    wanted = cloud.select(np.concatenate([first[:: write_lcc.COARSER], *others]))
-    found = converters.read(spoiled(path, lambda meta: meta["root"]["child"]["0"].pop("child")))[0]
-    assert np.array_equal(rows(found), rows(wanted))
-
-
-def test_part_of_a_file_may_be_read(tree):
-    path, cloud = tree
-    first, *others = write_lcc.regions(cloud)
-    wanted = cloud.select(np.concatenate([first[len(first) // 2 :], *others]))
-    found = converters.read(spoiled(path, lambda meta: meta["root"]["child"]["0"]["child"].pop("0")))[0]
+    wanted = cloud.select(np.concatenate([left(first), *others]))
+    found = converters.read(spoiled(path, lambda meta: change(meta["root"]["child"]["0"])))[0]
     assert np.array_equal(rows(found), rows(wanted))
 
 

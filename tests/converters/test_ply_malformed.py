@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from hostile import corpus
 
 from beam_warp import converters
 from beam_warp.cli.convert import main
@@ -262,30 +263,18 @@ def mutations(content, count, seed):
         yield bytes(damaged)
 
 
-@pytest.mark.parametrize("kind", ["binary", "text", "packed"])
-def test_damaged_files_are_read_or_refused(columns, ply_bytes, tmp_path, kind):
-    names = list(columns)
-    if kind == "binary":
-        content = ply_bytes(columns, comments=["beam_axes rub", "beam_frame 0 24"])
-    elif kind == "text":
-        rows = "".join(" ".join(str(columns[name][row]) for name in names) + "\n" for row in range(3))
-        header = "".join(f"property float {name}\n" for name in names)
-        content = f"ply\nformat ascii 1.0\nelement vertex 3\n{header}end_header\n{rows}".encode()
-    else:
-        words = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-        bounds = [f"{end}{group}{axis}" for group in ("_", "_scale_") for end in ("min", "max") for axis in "xyz"]
-        header = "element chunk 1\n" + "".join(f"property float {name}\n" for name in bounds)
-        header += "element vertex 2\n" + "".join(f"property uint {name}\n" for name in words)
-        body = np.linspace(-3.0, 3.0, 12, dtype="<f4").tobytes() + bytes(range(32))
-        content = f"ply\nformat binary_little_endian 1.0\n{header}end_header\n".encode() + body
+@pytest.mark.parametrize("make", [corpus.ply, corpus.text_ply, corpus.compressed_ply])
+def test_damaged_files_are_read_or_refused(make, tmp_path):
+    path = make(tmp_path)
+    content = path.read_bytes()
     refusals = []
     for damaged in mutations(content, 200, seed=len(content)):
-        (tmp_path / "a.ply").write_bytes(damaged)
+        path.write_bytes(damaged)
         started = time.perf_counter()
         try:
-            converters.read(tmp_path / "a.ply")
+            converters.read(path)
         except AssetFormatError as error:
             refusals.append(str(error))
         assert time.perf_counter() - started < 2.0
-    assert all(message.startswith("a.ply: ") for message in refusals)
+    assert all(message.startswith(f"{path.name}: ") for message in refusals)
     assert 20 < len(refusals) < 200  # the damage is neither harmless nor always fatal

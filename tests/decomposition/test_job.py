@@ -17,9 +17,9 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError, OutputError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
 from beam_warp.materials.light import LightCheck
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.light_turn import LightTurn
 from beam_warp.materials.roughness_source import RoughnessTexture
 from beam_warp.raster.records import RasterOptions

@@ -11,7 +11,7 @@ from beam_warp.decomposition.frames import GivenFrames
 from beam_warp.decomposition.options import RunOptions
 from beam_warp.decomposition.work import MaterialWork
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.plan.steps import Task, perform
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.environment import EnvironmentMap

@@ -14,7 +14,7 @@ from beam_warp.decomposition.frames import ReconstructedFrames
 from beam_warp.decomposition.job import OverviewOptions, run_capture
 from beam_warp.decomposition.work import MaterialWork
 from beam_warp.demo.from_images import FromImagesOptions, demo_steps
-from beam_warp.materials.direct import MaterialOptions
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.plan.crew import crew_of
 from beam_warp.plan.standing import look
 from beam_warp.plan.workers import Processes, in_process

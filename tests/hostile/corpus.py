@@ -5,6 +5,7 @@ A new reader is a row of `READERS`.
 
 import json
 import struct
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -105,46 +106,22 @@ def nerfstudio(folder: Path) -> Path:
     return folder / "transforms.json"
 
 
-def colmap_text(folder: Path) -> Path:
-    """A model of one photograph; its cameras are spoiled."""
+def colmap_text(folder: Path, spoiled: str = "cameras.txt") -> Path:
+    """A model of one photograph, one of whose files is spoiled."""
     (folder / "images.txt").write_text("1 1 0 0 0 0.5 0.25 3 1 a.png\n\n")
     (folder / "cameras.txt").write_text("1 PINHOLE 40 30 50.0 50.0 20.0 15.0\n")
     (folder / "points3D.txt").write_text("1 0.5 0.5 3 255 128 0 0.5 1 2\n")
-    return folder / "cameras.txt"
+    return folder / spoiled
 
 
-def colmap_text_images(folder: Path) -> Path:
-    """The same; its images are spoiled."""
-    colmap_text(folder)
-    return folder / "images.txt"
-
-
-def colmap_text_points(folder: Path) -> Path:
-    """The same; its points are spoiled."""
-    colmap_text(folder)
-    return folder / "points3D.txt"
-
-
-def colmap_cameras(folder: Path) -> Path:
-    """A binary model; its cameras are spoiled."""
+def colmap_binary(folder: Path, spoiled: str = "cameras.bin") -> Path:
+    """A binary model of one photograph, one of whose files is spoiled."""
     (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 1, 1, 40, 30, 50.0, 50.0, 20.0, 15.0))
     image = struct.pack("<QI7dI", 1, 1, 1.0, 0.0, 0.0, 0.0, 0.5, 0.25, 3.0, 1) + b"a.png\0" + struct.pack("<Q", 0)
     (folder / "images.bin").write_bytes(image)
     points = struct.pack("<QQ3d3BdQII", 1, 1, 0.5, 0.5, 3.0, 255, 128, 0, 0.5, 1, 1, 2)
     (folder / "points3D.bin").write_bytes(points)
-    return folder / "cameras.bin"
-
-
-def colmap_images(folder: Path) -> Path:
-    """The same; its images are spoiled."""
-    colmap_cameras(folder)
-    return folder / "images.bin"
-
-
-def colmap_points(folder: Path) -> Path:
-    """The same; its points are spoiled."""
-    colmap_cameras(folder)
-    return folder / "points3D.bin"
+    return folder / spoiled
 
 
 def projections(folder: Path) -> Path:
@@ -283,17 +260,21 @@ READERS: dict[str, Reader] = {
         cuts=(0.0, 0.3, 0.6),
     ),
     "colmap images, text": Reader(
-        colmap_text_images,
+        partial(colmap_text, spoiled="images.txt"),
         _capture,
         "captures",
         swaps={"a word": (b"0.25", b"x"), "nan": (b"0.25", b"nan"), "zero": (b"1 1 0", b"1 0 0")},
         cuts=(0.0, 0.3),
     ),
     "colmap points, text": Reader(
-        colmap_text_points, _capture, "captures", swaps={"nan": (b"0.5 0.5", b"nan 0.5")}, cuts=(0.3,)
+        partial(colmap_text, spoiled="points3D.txt"),
+        _capture,
+        "captures",
+        swaps={"nan": (b"0.5 0.5", b"nan 0.5")},
+        cuts=(0.3,),
     ),
     "colmap cameras": Reader(
-        colmap_cameras,
+        colmap_binary,
         _capture,
         "captures",
         swaps={
@@ -303,7 +284,7 @@ READERS: dict[str, Reader] = {
         },
     ),
     "colmap images": Reader(
-        colmap_images,
+        partial(colmap_binary, spoiled="images.bin"),
         _capture,
         "captures",
         swaps={
@@ -313,7 +294,7 @@ READERS: dict[str, Reader] = {
         },
     ),
     "colmap points": Reader(
-        colmap_points,
+        partial(colmap_binary, spoiled="points3D.bin"),
         _capture,
         "captures",
         swaps={"a count beyond the file": (struct.pack("<QQ", 1, 1), struct.pack("<QQ", 2**62, 1))},

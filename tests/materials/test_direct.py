@@ -11,8 +11,9 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials, view_set
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.exposure import estimate_exposure
+from beam_warp.materials.light_rays import MaterialOptions, view_set
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
@@ -232,17 +233,20 @@ class TestFailures:
 
 
 class TestExposure:
-    @pytest.mark.parametrize("stops", [-2.0, 0.0, 6.0])
-    def test_unknown_scale_of_the_light_is_found(self, rng, stops):
-        """Whites of 0.8 and blacks of 0.05, captured at some exposure: the light comes back to a quarter stop."""
+    def found(self, truth, stops, **given):
+        """Estimate the scale of a light that is some stops off, from a ball of greys [stop]."""
         points, spacing = sphere_points(1500)
-        truth = rng.choice([0.05, 0.3, 0.8], (1500, 1), p=[0.4, 0.4, 0.2]) * np.ones(3)
-        cloud = colored(cloud_of(tiles(points, points, spacing)), reflected(truth, np.pi), DISPLAY_SRGB)
+        cloud = colored(cloud_of(tiles(points, points, spacing)), reflected(truth * np.ones(3), np.pi), DISPLAY_SRGB)
         scene = Scene.from_gaussians(cloud, "cpu")
         surface, rough = certain(cloud, scene, points), np.full(1500, ROUGHNESS, np.float32)
         light = prepared(EVEN, "cpu").scaled(2.0**stops)
-        factor = estimate_exposure(cloud, scene, surface, rough, light, options=MaterialOptions())
-        assert abs(np.log2(factor) + stops) < 0.25
+        return np.log2(estimate_exposure(cloud, scene, surface, rough, light, options=MaterialOptions(), **given))
+
+    @pytest.mark.parametrize("stops", [-2.0, 0.0, 6.0])
+    def test_unknown_scale_of_the_light_is_found(self, rng, stops):
+        """Whites of 0.8 and blacks of 0.05, captured at some exposure: the light comes back to a quarter stop."""
+        truth = rng.choice([0.05, 0.3, 0.8], (1500, 1), p=[0.4, 0.4, 0.2])
+        assert abs(self.found(truth, stops) + stops) < 0.25
 
     @pytest.mark.parametrize(
         ("whites", "stops", "expected"),
@@ -251,14 +255,8 @@ class TestExposure:
     )
     def test_a_measured_light_is_changed_only_by_what_is_impossible(self, rng, whites, stops, expected):
         """A subject without white does not make it brighter; base colours above 1 do, as far as they must."""
-        points, spacing = sphere_points(1500)
-        truth = rng.choice([0.1, 0.3, whites], (1500, 1)) * np.ones(3)
-        cloud = colored(cloud_of(tiles(points, points, spacing)), reflected(truth, np.pi), DISPLAY_SRGB)
-        scene = Scene.from_gaussians(cloud, "cpu")
-        surface, rough = certain(cloud, scene, points), np.full(1500, ROUGHNESS, np.float32)
-        light = prepared(EVEN, "cpu").scaled(2.0**stops)
-        factor = estimate_exposure(cloud, scene, surface, rough, light, options=MaterialOptions(), is_measured=True)
-        assert expected[0] <= np.log2(factor) <= expected[1]
+        truth = rng.choice([0.1, 0.3, whites], (1500, 1))
+        assert expected[0] <= self.found(truth, stops, is_measured=True) <= expected[1]
 
 
 def test_views_are_unit_and_on_the_visible_side():

@@ -29,7 +29,7 @@ from beam_warp.kernels.materials.residues import (
 from beam_warp.kernels.trace.surface_rays import RayBatch
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda, specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.direct import view_set
+from beam_warp.materials.light_rays import view_set
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 

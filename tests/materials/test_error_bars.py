@@ -16,8 +16,9 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
-from beam_warp.materials.direct import MaterialOptions, measure_materials
+from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.evidence import view_evidence
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.world.camera import Camera

@@ -13,9 +13,8 @@ from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light import check_light, judge_light, light_evidence, looks_like_ldr
 from beam_warp.materials.light_fits import LEAST_POINTS, LIGHT_COLUMNS
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.stability.material_cases import MaterialStudio
-from beam_warp.study.true_surface import colored_by_views, gaussians_on_mesh
+from beam_warp.study.true_surface import surface_of_capture
 from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 
@@ -177,10 +176,7 @@ def test_gaussians_and_photographs_tell(device, monkeypatch):
 @pytest.fixture(scope="module")
 def figure(tiny_capture):
     """Evidence of the demo's capture, seen by 6 cameras of 64 x 64 pixels."""
-    views = [record.view() for record in tiny_capture.select(split="train", frames={0})]
-    mesh = read_truth_mesh(tiny_capture, 0)
-    bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), 2000)
-    cloud = colored_by_views(bare, views, device="cpu")
+    cloud, views = surface_of_capture(tiny_capture, 0, 2000, device="cpu")
     seen = view_evidence(cloud, [view.camera for view in views], views, device="cpu")
     scene = Scene.from_gaussians(cloud, "cpu")
     return light_evidence(scene, SurfacePoints.seen_by(cloud, seen, scene), seen, 1024)

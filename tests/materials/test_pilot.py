@@ -10,7 +10,7 @@ from support.shapes import cloud_of, colored, sphere_points, tiles
 from beam_warp import Scene
 from beam_warp.errors import InvalidOptionError
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.direct import MaterialOptions, light_batches, lit_points
+from beam_warp.materials.light_rays import MaterialOptions, light_batches, lit_points
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints
 from beam_warp.materials.pilot import RATE, SHARE, economy, rays_needed, summary
 from beam_warp.world.environment import EnvironmentMap

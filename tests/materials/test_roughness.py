@@ -17,8 +17,8 @@ from beam_warp.kernels.materials.roughness_profile import ProfileFit, launch_lob
 from beam_warp.kernels.trace.surface_rays import RayBatch
 from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
-from beam_warp.materials.direct import MaterialOptions
 from beam_warp.materials.evidence import ViewEvidence
+from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.roughness import (
     CANDIDATES,

@@ -55,7 +55,7 @@ def excess(images, truth):
 def test_a_sample_is_valid_and_small(name):
     for file in ("asset.usdc", "scene.usda"):
         assert [str(found) for found in validate_stage(opened(name, file)).findings] == []
-    assert sum(path.stat().st_size for path in (SAMPLES / name).iterdir()) < 300_000
+    assert sum(path.stat().st_size for path in (SAMPLES / name).iterdir()) < 150_000
     assert read_asset(SAMPLES / name / "asset.usdc", trusted=True).metadata["license"] == "CC0-1.0"
 
 

@@ -97,23 +97,23 @@ def rod(start: NDArray[np.float64], along: NDArray[np.float64], length: float, r
 
 def furnace() -> Sample:
     """A white ball in uniform light: it reflects all of it, so that every solid pixel has the radiance of the light."""
-    return Sample([surface((ball(np.zeros(3), 0.5, 0.033), (1.0, 1.0, 1.0), 0.4))], -2.4 * Y, np.zeros(3), dome=0.5)
+    return Sample([surface((ball(np.zeros(3), 0.5, 0.05), (1.0, 1.0, 1.0), 0.4))], -2.4 * Y, np.zeros(3), dome=0.5)
 
 
 def roughness() -> Sample:
     """Five balls of one base colour, from smooth to rough."""
     levels = (0.25, 0.4, 0.55, 0.7, 0.9)
-    balls = [(ball(0.3 * (i - 2) * X, 0.14, 0.0165), (0.35, 0.08, 0.05), level) for i, level in enumerate(levels)]
+    balls = [(ball(0.3 * (i - 2) * X, 0.14, 0.024), (0.35, 0.08, 0.05), level) for i, level in enumerate(levels)]
     return Sample([surface(*balls)], -2.35 * Y + 0.4 * Z, np.zeros(3), dome=0.15, sun=(Y - 0.5 * X - 1.2 * Z, 1.2))
 
 
 def still_life() -> Sample:
     """A wall, a ball and a bowl on a floor, with occlusion; the stage is z up."""
-    bowl = sphere_zone(-0.4 * X - 0.3 * Y + 0.36 * Z, 0.36, -1.0, -0.1, 0.05)
+    bowl = sphere_zone(-0.4 * X - 0.3 * Y + 0.36 * Z, 0.36, -1.0, -0.1, 0.06)
     parts: list[Part] = [
-        (rectangle(np.zeros(3), X, Y, 0.05), (0.6, 0.6, 0.6), 0.6),
-        (rectangle(Y + 0.5 * Z, X, 0.5 * Z, 0.05), (0.15, 0.3, 0.6), 0.8),
-        (ball(0.4 * X + 0.2 * Y + 0.4 * Z, 0.4, 0.045), (0.75, 0.3, 0.08), 0.5),
+        (rectangle(np.zeros(3), X, Y, 0.08), (0.6, 0.6, 0.6), 0.6),
+        (rectangle(Y + 0.5 * Z, X, 0.5 * Z, 0.08), (0.15, 0.3, 0.6), 0.8),
+        (ball(0.4 * X + 0.2 * Y + 0.4 * Z, 0.4, 0.06), (0.75, 0.3, 0.08), 0.5),
         (TiledSurface(bowl.points, -bowl.normals, bowl.spacing), (0.15, 0.5, 0.2), 0.5),
     ]
     eye, target = np.array([-1.1, -4.3, 2.1]), np.array([0.0, 0.1, 0.35])
@@ -122,12 +122,12 @@ def still_life() -> Sample:
 
 def tripod() -> Sample:
     """Rods to the right (red), forward (green) and up (blue), of different lengths; the hub shows directions."""
-    hub = ball(np.zeros(3), 0.09, 0.014)
+    hub = ball(np.zeros(3), 0.09, 0.018)
     rods = [
-        (rod(np.zeros(3), axis, length, 0.03, 0.014), tuple(0.05 + 0.6 * axis), 0.5)
+        (rod(np.zeros(3), axis, length, 0.03, 0.016), tuple(0.05 + 0.6 * axis), 0.5)
         for axis, length in ((X, 0.55), (Y, 0.4), (Z, 0.3))
     ]
-    tip = ball(0.55 * X, 0.05, 0.014)
+    tip = ball(0.55 * X, 0.05, 0.016)
     cloud = surface((hub, (0.5, 0.5, 0.5), 0.5), *rods, (tip, (0.7, 0.6, 0.1), 0.5))
     radiance = np.zeros((len(cloud), 4, 3))
     radiance[:, 0] = (linear_to_srgb(cloud.base_color) - 0.5) / SH_C0
@@ -142,8 +142,8 @@ def tripod() -> Sample:
 
 def rolling() -> Sample:
     """A two-coloured ball that rolls to the right over a floor, in four frames; rows keep their identity."""
-    radius, floor = 0.16, rectangle(np.zeros(3), 0.5 * X, 0.3 * Y, 0.028)
-    start = ball(np.zeros(3), radius, 0.024)
+    radius, floor = 0.16, rectangle(np.zeros(3), 0.5 * X, 0.3 * Y, 0.04)
+    start = ball(np.zeros(3), radius, 0.032)
     lower = start.points[:, 2] < 0.0
     halves = [TiledSurface(start.points[rows], start.normals[rows], start.spacing) for rows in (lower, ~lower)]
     frames = []

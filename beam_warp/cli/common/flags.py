@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -71,6 +71,12 @@ def notes_of(sequence: GaussianSequence) -> list[str]:
 def stated(**options: Any) -> dict[str, Any]:
     """Return the options that were given: those that are not None."""
     return {name: value for name, value in options.items() if value is not None}
+
+
+def options_of(command: Any, kind: type, **others: Any) -> Any:
+    """Return a record of options: those that a command has by the same names, and others."""
+    names = {field.name for field in fields(kind)} & {field.name for field in fields(command)}
+    return kind(**{name: getattr(command, name) for name in names - set(others)}, **others)
 
 
 def raster_options(metadata: Mapping[str, str], antialiased: str | None, low_pass: float | None) -> RasterOptions:

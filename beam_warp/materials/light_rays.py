@@ -1,0 +1,378 @@
+"""Light of Gaussians in one frame: rays from each towards the light, and what they leave in every view.
+
+Rays are traced once per Gaussian; every view's diffuse and specular residue comes from the same rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from beam_warp.checks import require_choice, require_count, require_number
+from beam_warp.device.arrays import upload, zero_struct
+from beam_warp.errors import InvalidArrayError
+from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
+from beam_warp.jobs.listeners import CountProgress
+from beam_warp.kernels.common.sampling import SampleSet
+from beam_warp.kernels.light.product_sampling import launch_accumulate_block_weights
+from beam_warp.kernels.materials.residues import (
+    ALBEDO_SCALING,
+    FRESNEL_HV,
+    GatheredLight,
+    LightRays,
+    Observations,
+    ShadedPoints,
+    launch_gather_light,
+    launch_sample_radiance,
+    launch_trace_bounce,
+    launch_view_residues,
+)
+from beam_warp.kernels.trace.incident_light import (
+    PRODUCT,
+    launch_draw_light,
+    launch_recall_visibility,
+    launch_sum_unshadowed,
+)
+from beam_warp.kernels.trace.surface_rays import RayBatch
+from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.materials.evidence import ViewEvidence
+from beam_warp.materials.normals import SurfacePoints
+from beam_warp.materials.pilot import rays_needed
+from beam_warp.trace.incident import DENSITIES, Density, techniques
+from beam_warp.trace.rays import points_for_weights, ray_batches, room_for_rays
+from beam_warp.trace.sampling import SAMPLERS, Sampler, sample_set
+from beam_warp.trace.scene import Scene
+from beam_warp.trace.transmittance import EXACT, trace_rays
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import SH_C0
+
+BOUNCE_PART = 4
+"""The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""
+
+FEWEST_FIRST_RAYS = 4
+"""First rays of a Gaussian, of which an error can be stated."""
+
+VIEW_COUNT = 8
+SMALLEST_VIEW_COSINE = 0.2
+"""Least n.v of a view, where there are no images: below, the normal and the lobe's edge dominate."""
+
+DiffuseWeight = Literal["albedo_scaling", "fresnel_hv"]
+
+DIFFUSE_WEIGHTS: dict[str, int] = {"albedo_scaling": int(ALBEDO_SCALING), "fresnel_hv": int(FRESNEL_HV)}
+"""Ways to weigh the light that is left for diffusion, and the kernels' numbers for them: ``"albedo_scaling"``, what the
+specular lobe as a whole does not reflect, which conserves energy; ``"fresnel_hv"``, 1 - F(h.v) for every ray (the
+paper's 1 - F, with Schlick's F)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialOptions:
+    """Options of the direct path.
+
+    Attributes:
+        sample_count: Rays per Gaussian and frame for visibility; a power of two is best.
+        light_error: Relative standard error, as it is stated, with which a Gaussian gets ``sample_count`` rays towards
+            the light. Others get from a quarter to four times as many, those with larger errors more, as the first rays
+            of their neighbours tell (`beam_warp.materials.pilot`). With 0, and for sets that do not go on
+            (``"stratified"``, ``"mis"``), each gets ``sample_count``.
+        offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.trace.rays`.
+        bounce: Add one bounce from the captured radiance of what rays hit (the paper leaves it out).
+        diffuse_weight: What the specular lobe leaves for diffusion, one of `DIFFUSE_WEIGHTS`.
+        sampler: Sample sets; see `beam_warp.irradiance`.
+        density: What light rays are drawn by; see there.
+        ratio: Whether rays only say which share of the unshadowed light arrives; see there.
+        robust: Count views little that disagree with the others.
+        seed: Same seed, same device, same bits.
+
+    Raises:
+        InvalidOptionError: An option is out of range.
+    """
+
+    sample_count: int = 64
+    light_error: float = 0.05
+    offset: float | Literal["auto"] = "auto"
+    bounce: bool = True
+    diffuse_weight: DiffuseWeight = "albedo_scaling"
+    sampler: Sampler = "owen"
+    density: Density = "product"
+    ratio: bool = True
+    robust: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every option once."""
+        require_count("sample_count", self.sample_count, 4, 4096)
+        require_number("light_error", self.light_error, 0.0, 1.0)
+        require_choice("diffuse_weight", self.diffuse_weight, tuple(DIFFUSE_WEIGHTS))
+        require_choice("sampler", self.sampler, SAMPLERS)
+        require_choice("density", self.density, DENSITIES)
+        require_count("seed", self.seed, 0, 2**32 - 1)
+        if self.offset != "auto":
+            require_number("offset", self.offset)
+
+    @property
+    def light_rays(self) -> tuple[int, int]:
+        """Fewest and most rays towards the light of a Gaussian."""
+        if self.light_error == 0.0 or self.sampler == "stratified" or self.density == "mis":
+            return self.sample_count, self.sample_count
+        fewest = max(self.sample_count // 4, FEWEST_FIRST_RAYS)
+        return fewest, max(4 * self.sample_count, fewest)
+
+
+@dataclass(frozen=True, eq=False)
+class LitPoints:
+    """Points whose light is known; all arrays are on the device and by row.
+
+    Attributes:
+        light: The light at each point; filled batch by batch by `light_batches`.
+        surface: Their normals and roughness.
+        views: What views show of them.
+        rows: Which Gaussians they are, ``(M,)``.
+        rays: How many rays go towards the light, ``(M,)``; filled when `light_batches` begins.
+    """
+
+    light: GatheredLight
+    surface: ShadedPoints
+    views: Observations
+    rows: NDArray[np.int64]
+    rays: NDArray[np.int32]
+
+
+def view_set() -> NDArray[np.float32]:
+    """Return unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
+    index = np.arange(VIEW_COUNT) + 0.5
+    z = 1.0 - (1.0 - SMALLEST_VIEW_COSINE) * index / VIEW_COUNT
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1).astype(np.float32)
+
+
+def lit_points(
+    cloud: GaussianCloud,
+    points: SurfacePoints,
+    roughness: NDArray[np.float32],
+    light: PreparedEnvironment,
+    rows: NDArray[np.integer[Any]],
+    views: ViewEvidence | None,
+) -> LitPoints:
+    """Make room for the light of some Gaussians, and collect what views show of them.
+
+    Raises:
+        InvalidArrayError: The cloud has no captured radiance.
+    """
+    radiance = require_radiance(cloud)
+    device, count = light.device, len(rows)
+    at = upload(np.asarray(rows, np.int32), int, device)
+    observed = Observations()
+    if views is None:
+        observed.colors = wp.empty((VIEW_COUNT, count), dtype=wp.vec4, device=device)
+        observed.directions = wp.empty((VIEW_COUNT, count), dtype=wp.vec3, device=device)
+        launch_sample_radiance(
+            len(at),
+            upload(radiance, wp.vec3, device),
+            at,
+            int(cloud.radiance_color_space == DISPLAY_SRGB),
+            points.normals[at].contiguous(),
+            upload(view_set(), wp.vec3, device),
+            observed.colors,
+            observed.directions,
+            device,
+        )
+    else:
+        observed.colors = views.colors[:, at].contiguous()
+        observed.directions = views.directions[:, at].contiguous()
+    surface = ShadedPoints()
+    surface.normals = points.normals[at].contiguous()
+    surface.roughness = upload(roughness[rows].astype(np.float32), float, device)
+    observed.specular = wp.zeros(observed.directions.shape, dtype=wp.vec3, device=device)
+    observed.diffuse_share = wp.zeros(observed.directions.shape, dtype=float, device=device)
+    arriving = zero_struct(GatheredLight, len(rows), device)
+    launch_sum_unshadowed(len(surface.normals), light.moments, surface.normals, arriving.unshadowed, device)
+    return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64), np.zeros(len(rows), np.int32))
+
+
+def light_batches(
+    scene: Scene,
+    points: SurfacePoints,
+    light: PreparedEnvironment,
+    measured: LitPoints,
+    options: MaterialOptions,
+    hit_radiance: NDArray[np.float32] | None,
+    frame: int,
+    progress: CountProgress,
+) -> Iterator[tuple[RayBatch, LightRays]]:
+    """Trace the light of some points, batch by batch, and fill in what it leaves in every view.
+
+    Each batch comes with its rays, which are gone when the next one is asked for.
+
+    Args:
+        scene: Occluders.
+        points: Of all Gaussians.
+        light: The light.
+        measured: Which points; its arrays are filled.
+        options: Rays and what they are drawn by.
+        hit_radiance: What rays that hit a Gaussian see of it, scene-linear, ``(N, 3)``: one bounce; None keeps the
+            bounce that ``measured`` holds.
+        frame: Number of the frame.
+        progress: Called with (points done, points in all).
+    """
+    device = scene.device
+    if not len(measured.rows):
+        return
+    bounced = None if hit_radiance is None else upload(hit_radiance, wp.vec3, device)
+    stream, ways = (options.seed, frame), LightPaths.of(scene, points, light, measured, options, frame)
+    measured.rays[:], pilot = ways.counted(measured.light)
+    done = 0
+    for count in np.unique(measured.rays):
+        for batch in ways.batches(int(count), np.flatnonzero(measured.rays == count)):
+            found = ways.traced(batch, pilot)
+            if bounced is not None:
+                fewer = max(options.sample_count // BOUNCE_PART, 2)
+                launch_trace_bounce(scene, EXACT.settings(scene), batch, bounced, stream, fewer, measured.light.bounce)
+            launch_gather_light(len(batch.rows), batch, found, int(options.ratio), measured.light, device)
+            launch_view_residues(
+                batch,
+                found,
+                measured.light,
+                light.blurred,
+                measured.surface,
+                DIFFUSE_WEIGHTS[options.diffuse_weight],
+                measured.views,
+                device,
+            )
+            yield batch, found
+            done += len(batch.rows)
+            progress(done, len(measured.rows))
+
+
+class Pilot(NamedTuple):
+    """What the first rays of every point met: the set they are, where each row is, and visibility by place and slot."""
+
+    samples: SampleSet
+    places: wp.array
+    visibility: wp.array
+
+
+@dataclass(frozen=True, eq=False)
+class LightPaths:
+    """Rays from points towards the light; arrays are on the device and by row."""
+
+    scene: Scene
+    light: PreparedEnvironment
+    positions: wp.array
+    normals: wp.array
+    offsets: wp.array
+    options: MaterialOptions
+    frame: int
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        points: SurfacePoints,
+        light: PreparedEnvironment,
+        measured: LitPoints,
+        options: MaterialOptions,
+        frame: int,
+    ) -> LightPaths:
+        """Collect what rays of the measured points need."""
+        at = upload(measured.rows.astype(np.int32), int, scene.device)
+        positions, offsets = points.positions[at].contiguous(), points.offsets[at].contiguous()
+        return cls(scene, light, positions, measured.surface.normals, offsets, options, frame)
+
+    def batches(self, count: int, rows: NDArray[np.integer[Any]]) -> list[RayBatch]:
+        """Return batches of so many rays from some of the points."""
+        is_product, device = self.options.density == "product", self.scene.device
+        return ray_batches(
+            self.scene,
+            self.positions,
+            self.normals,
+            self.offsets,
+            count,
+            stream=(self.options.seed, self.frame),
+            points_at_once=points_for_weights(device) if is_product else None,
+            chosen=None if len(rows) == len(self.positions) else upload(rows.astype(np.int32), int, device),
+        )
+
+    def traced(self, batch: RayBatch, pilot: Pilot | None = None) -> LightRays:
+        """Draw and trace the rays of a batch; those that the pilot has traced are taken from there."""
+        device, count = self.scene.device, len(batch.rows)
+        parts = techniques(self.options.density, self.options.sampler, batch.sample_count)
+        is_product = parts[0].density == int(PRODUCT)
+        cumulative = wp.empty((count, 512) if is_product else (0, 0), dtype=float, device=device)
+        if is_product:
+            launch_accumulate_block_weights(count, self.light.blocks, batch.normals, cumulative, device)
+        rays = room_for_rays(batch, device, bernoulli=False, reaches=True)
+        found = LightRays()
+        found.directions = rays.directions
+        found.weights = wp.empty(len(rays.origins), dtype=wp.vec3, device=device)
+        found.visibility = wp.empty(len(rays.origins), dtype=float, device=device)
+        found.paired = int(all(part.samples.columns > 0 for part in parts))
+        for part in parts:
+            part.known = 0 if pilot is None else pilot.samples.count
+            launch_draw_light(part, self.light, cumulative, batch, rays, found.weights, device)
+        trace_rays(self.scene, EXACT, rays, found.visibility)
+        if pilot is not None:
+            items = count * pilot.samples.count
+            launch_recall_visibility(items, parts[0], pilot.samples, batch, *pilot[1:], found.visibility, device)
+        return found
+
+    def counted(self, out_light: GatheredLight) -> tuple[NDArray[np.int32], Pilot | None]:
+        """Return how many rays each point needs, and what its first ones met; ``out_light`` is used for their error."""
+        (first, most), device, count = self.options.light_rays, self.scene.device, len(self.positions)
+        if first == most:
+            return np.full(count, most, np.int32), None
+        rows, seen = [], []
+        for batch in self.batches(first, np.arange(count)):
+            found = self.traced(batch)
+            launch_gather_light(len(batch.rows), batch, found, int(self.options.ratio), out_light, device)
+            rows.append(batch.rows.numpy())
+            seen.append(found.visibility)
+        order = np.concatenate(rows)
+        needed, places = np.empty(count, np.int32), np.empty(count, np.int32)
+        needed[order] = rays_needed(
+            out_light.noise.numpy()[order],
+            first,
+            most,
+            count=self.options.sample_count,
+            target=self.options.light_error,
+        )
+        places[order] = np.arange(count)
+        known = wp.empty(count * first, dtype=float, device=device)
+        for start, part in zip(np.cumsum([0, *map(len, seen)]), seen, strict=False):
+            wp.copy(known, part, dest_offset=int(start))
+        return needed, Pilot(sample_set(self.options.sampler, first), upload(places, int, device), known)
+
+
+def require_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
+    """Return the captured radiance of Gaussians, ``(N, K, 3)``.
+
+    Raises:
+        InvalidArrayError: There is none.
+    """
+    if cloud.radiance is None:
+        raise InvalidArrayError(
+            "radiance must be given to decompose materials, got None. Import Gaussians with captured colour."
+        )
+    return cloud.radiance
+
+
+def mean_radiance(cloud: GaussianCloud, views: ViewEvidence | None) -> NDArray[np.float32]:
+    """Return what a ray that hits a Gaussian sees, ``(N, 3)``: hits are taken as diffuse, so its mean colour.
+
+    Over the views that show it; the band of degree 0 is the mean over all directions, seen or not.
+    """
+    assert cloud.radiance is not None
+    mean = 0.5 + SH_C0 * cloud.radiance[:, 0]
+    if cloud.radiance_color_space == DISPLAY_SRGB:
+        mean = srgb_to_linear(np.clip(mean, 0.0, 1.0))
+    if views is not None and views.colors.shape[0]:
+        colors = views.colors.numpy()
+        weight = colors[..., 3].sum(axis=0)
+        shown = np.einsum("vn,vnc->nc", colors[..., 3], colors[..., :3])
+        mean = np.where((weight > 0.0)[:, None], shown / np.maximum(weight, 1e-12)[:, None], mean)
+    return np.asarray(np.maximum(mean, 0.0), np.float32)
