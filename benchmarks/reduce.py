@@ -75,6 +75,8 @@ Keep = Callable[[Reducer, GaussianCloud, int, Path | None], GaussianCloud]
 FRESH, FRESH_PAIRS = 77, 200
 """Seed and number of draws that no search and no certificate saw."""
 
+DEFAULT_STEPS = ReduceOptions(gaussians=1).steps
+
 MOST_LOSS = 1.0
 """Bound that the fewest Gaussians are asked for [dB]."""
 
@@ -279,7 +281,8 @@ def certified(bench: Bench) -> Iterator[Row]:
         original = asset(name, bench)
         truth = against_truth(name, original, bench) or ASSET_PSNR
         for target in ({"gaussians": round(bench.shares[0] * len(original[0]))}, {"max_loss": MOST_LOSS}):
-            options = ReduceOptions(**target, asset_psnr=truth, height=height, device=bench.device)
+            changes: Row = {"gaussians": None, "asset_psnr": truth, "height": height, **target}
+            options = replace(bench.options, steps=min(DEFAULT_STEPS, bench.options.steps), **changes)
             rows.append({"name": f"{name} {target}", "asset": name, "target": target, "asset_psnr": truth})
             with tempfile.TemporaryDirectory() as folder:
                 started = time.perf_counter()
