@@ -247,7 +247,7 @@ def sizes(bench: Bench) -> Iterator[Row]:
                 place = None if bench.made is None else bench.made / f"{name}_{share:g}.ply"
                 count = round(share * len(cloud))
                 try:
-                    rows.append(row | contend(functools.partial(keep, place=place), reducer, cloud, count, judge))
+                    rows.append(row | contend(keep, reducer, cloud, count, place, judge))
                 except (npm_packages.MissingPackagesError, subprocess.SubprocessError) as error:
                     rows.append(row | {"absent": str(error)})
                 bench.say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
@@ -255,15 +255,16 @@ def sizes(bench: Bench) -> Iterator[Row]:
 
 
 def contend(
-    keep: Callable[[Reducer, GaussianCloud, int], GaussianCloud],
+    keep: Keep,
     reducer: Reducer,
     cloud: GaussianCloud,
     count: int,
+    place: Path | None,
     judge: Callable[[GaussianCloud], Row],
 ) -> Row:
     """Measure one contender, as it is and refitted."""
     started = time.perf_counter()
-    bare = keep(reducer, cloud, count)
+    bare = keep(reducer, cloud, count, place)
     chosen = time.perf_counter()
     turn = Rotation.identity(len(bare))
     how = {"steps": reducer.options.steps, "raster": reducer.raster, "device": reducer._device}
