@@ -231,6 +231,9 @@ MATERIALS = (
     Constant("beam_warp.materials.direct:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
     Constant("beam_warp.materials.normals:LIFT_IN_REACHES", BOTH, "Lift of rays, in reaches of the Gaussians above."),
+    Constant("beam_warp.materials.normals:FACE_SPREAD", BOTH, "Normals of one face, beside an edge [rad]."),
+    Constant("beam_warp.materials.normals:FACE_PASSES", BOTH, "Rounds of averaging over a face."),
+    Constant("beam_warp.materials.normals:LEAST_TOWARDS", JUDGED, "An own axis that faces as pixels see."),
     Constant(EVIDENCE + "LEAST_WEIGHT", BOTH, "Pixels that must show a Gaussian for it to be seen."),
     Constant(EVIDENCE + "LEAST_SHARE", BOTH, "Part of its own pixels that they must be."),
     Constant(EVIDENCE + "LEAST_AGREEMENT", JUDGED, "Agreement of normals below which there is none."),
@@ -336,6 +339,7 @@ MATERIALS = (
             ("LEAST_CHANCE", "Least probability of a roughness."),
             ("LEAST_SPREAD", "Least standard deviation of a colour."),
             ("FIT_GAUSSIANS", "Gaussians of the surface at which views are compared."),
+            ("FIT_STEPS", "Steps of its fit."),
         )
     ),
     *(
@@ -378,6 +382,7 @@ MATERIALS = (
             ("FAR", "Step that is taken at a coarser level first [pixel of the level]."),
             ("WORST_ERROR", "Standard error from which silhouettes are asked [pixel]."),
             ("POOR", "Quality below which silhouettes are asked [dB]."),
+            ("UNMET", "Quality below which photographs are not of one subject [dB]."),
         )
     ),
     *(
@@ -536,7 +541,7 @@ UNTUNED = {
         beam_warp.reconstruction.hull: DISTANCE_LIMIT
         beam_warp.reconstruction.rig: FEWEST_CAMERAS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
         beam_warp.reconstruction.rig: SHORTEST_SIDE
-        beam_warp.reconstruction.alignment: NUMBERS
+        beam_warp.reconstruction.alignment: ENCODED_KNEE NUMBERS
         beam_warp.reconstruction.stereo: LEVELS SMALLEST_SIDE LEAST_PIXELS
         beam_warp.reconstruction.unmasked: PIXELS
         beam_warp.kernels.reconstruction.patch_match: STEP SIDE SAMPLES

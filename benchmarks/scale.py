@@ -1,9 +1,10 @@
-"""How long takes scale: the plan of a take, carried out by simulated workers, and what the driver adds at the end.
+"""How long takes scale: the plan of a take, carried out by simulated workers, and what is left to do at the end.
 
     python benchmarks/scale.py [--quick] [--parts PART] --out result.json
 
 - ``constants``: seconds of a step by stage, from results that were measured on a GPU (`RECONSTRUCTED`, `DECOMPOSED`);
-  and of writing the asset, a frame, measured here, by the processor's time of a cloud in which everything varies.
+  and of writing an asset, measured here on one core, of clouds in which everything varies: surveying a frame, its part
+  of a clip, and what is left at the end.
 - ``takes``: the plan that ``beam run`` makes of 18,000 frames, handed out by the schedule that carries it out.
 - ``check``: a take of steps that sleep, carried out by processes of this machine, beside its simulation.
 
@@ -26,24 +27,30 @@ import numpy as np
 import parts
 import record
 
-from beam_warp import converters
+from beam_warp.converters.clips import ClipWork
 from beam_warp.decomposition.frames import ReconstructedFrames
 from beam_warp.decomposition.options import RunOptions
 from beam_warp.decomposition.work import MaterialWork
 from beam_warp.device.arrays import resolve_device
+from beam_warp.jobs.listeners import no_progress
 from beam_warp.outputs import replacing
 from beam_warp.plan.carry import carry_out
 from beam_warp.plan.crew import crew_of
 from beam_warp.plan.standing import simulated
-from beam_warp.plan.steps import Plan, Step, Task
+from beam_warp.plan.steps import Plan, Receipt, Step, Task
+from beam_warp.plan.workers import InProcess
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_segments
 from beam_warp.reconstruction.job import ReconstructionWork, ReconstructOptions
+from beam_warp.schema.writer import CLIP_FRAMES
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 Row = dict[str, Any]
 
 RECONSTRUCTED, DECOMPOSED = "reconstruction_h200.json", "materials_cost_h200.json"
+ASSETS = ("gaussians", "asset")
+"""Assets that a take becomes: what was reconstructed, and what can be relit. Both are charged as the larger one."""
+
 FRAMES, WORKERS, SEGMENTS = 18_000, (1, 2, 8, 64, 256, 1024), (30, 120)
 
 
@@ -69,7 +76,7 @@ class Bench:
 
     @functools.cached_property
     def written_frame(self) -> Row:
-        """Seconds of the processor, and bytes, of a frame of an asset."""
+        """Seconds of the processor, and bytes, of a frame of an asset; and seconds of what is left at the end."""
         clouds = [_random_cloud(self.count, seed) for seed in range(3)]
         sequence = GaussianSequence(
             frame_count=self.written,
@@ -79,12 +86,25 @@ class Bench:
             topology="perFrame",
             metadata={},
         )
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            clips = ClipWork(folder, "asset", lambda: sequence, [()] * self.written, range(self.written))
+            plan, spent, began = clips.plan(), dict[str, float](), time.process_time()
+
+            def count(step: Step, receipt: Receipt | None, error: str) -> None:
+                nonlocal began
+                spent[step.stage] = spent.get(step.stage, 0.0) + time.process_time() - began
+                began = time.process_time()
+
+            receipts = carry_out(plan, InProcess(plan.works, no_progress), count)
             began = time.process_time()
-            layers = converters.write(sequence, Path(folder) / "asset.usda")
-            seconds = time.process_time() - began
-            size = sum(layer.stat().st_size for layer in layers)
-        return {"seconds": seconds / self.written, "bytes": size / self.written}
+            layers = clips.write(sequence, folder / "asset.usda", receipts)
+            return {
+                "survey": spent["asset-survey"] / self.written,
+                "clip": spent["asset-clip"] / self.written,
+                "end": spent["asset-whole"] + time.process_time() - began,
+                "bytes": sum(layer.stat().st_size for layer in layers) / self.written,
+            }
 
 
 def _random_cloud(count: int, seed: int) -> GaussianCloud:
@@ -155,33 +175,40 @@ def as_stages(steps: tuple[Step, ...]) -> tuple[Step, ...]:
 
 
 def takes(bench: Bench) -> Iterator[Row]:
-    """Hours, GPU hours and efficiency of a take, by workers; with and without the driver's own work at the end."""
+    """Hours, GPU hours and efficiency of a take, by workers; also were its assets written by one process at the end."""
     (known,) = constants(bench)
+    written = known["written"]
+    survey, clip = (CLIP_FRAMES * written[name] for name in ("survey", "clip"))
     seconds = {
         "key_frame": known["key_frame"],
         "frame": known["tracked_frame"],
         "materials": known["materials"],
         "light": 0.0,
         "preview": 0.0,
+        **{f"{asset}-{stage}": spent for asset in ASSETS for stage, spent in (("survey", survey), ("clip", clip))},
+        **{f"{asset}-whole": 0.0 for asset in ASSETS},
     }
     rows: list[Row] = []
     for segment in SEGMENTS:
         steps = as_stages(take_steps(bench.frames, segment))
-        work = sum(seconds[step.stage] for step in steps)
-        end = bench.frames * known["written"]["seconds"]
+        frames = tuple(step for step in steps if not step.stage.startswith(ASSETS))
+        work = sum(seconds[step.stage] for step in frames)
+        serial = len(ASSETS) * bench.frames * (written["survey"] + written["clip"])
+        end = len(ASSETS) * written["end"]
         for workers in WORKERS:
-            spent = simulated(steps, (), seconds, workers)
+            spent = simulated(steps, (), seconds, workers) + end
+            alone = simulated(frames, (), seconds, workers) + serial + end
             rows.append(
                 {
                     "name": f"{workers} x {segment}",
                     "workers": workers,
                     "segment": segment,
                     "hours": spent / 3600.0,
-                    "end_hours": end / 3600.0,
                     "busy_hours": work / 3600.0,
                     "efficiency": work / (workers * spent),
-                    "efficiency_with_end": work / (workers * (spent + end)),
                     "frames_per_hour_a_worker": bench.frames / (spent / 3600.0) / workers,
+                    "hours_written_by_one": alone / 3600.0,
+                    "efficiency_written_by_one": work / (workers * alone),
                 }
             )
             bench.say(json.dumps(rows[-1]))
@@ -216,8 +243,9 @@ class Naps:
 
 
 def check(bench: Bench) -> Iterator[Row]:
-    """Compare the simulation with processes that sleep through the plan of 16 segments."""
+    """Compare the simulation with processes that sleep through the plan of 16 segments, two assets included."""
     seconds = {"key_frame": 12.0, "frame": 11.0, "materials": 3.0, "light": 1.0, "preview": 1.0}
+    seconds |= {f"{asset}-{stage}": 3.0 for asset in ASSETS for stage in ("survey", "clip", "whole")}
     naps = {stage: bench.nap * spent for stage, spent in seconds.items()}
     steps = as_stages(take_steps(16 * 5, 5))
     rows: list[Row] = []
@@ -257,7 +285,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=tuple(PARTS), default=())
     record.add_arguments(parser)
     arguments = parser.parse_args()
-    bench = Bench(frames=600, count=2000, written=6, nap=0.01) if arguments.quick else Bench()
+    bench = Bench(frames=600, count=2000, written=70, nap=0.01) if arguments.quick else Bench()
     keep = functools.partial(record.write_result, arguments, resolve_device("cpu"))
     parts.measure(PARTS, bench, only=arguments.parts, keep=keep)
 

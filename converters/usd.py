@@ -13,7 +13,7 @@ from beam_warp.converters.common.options import ReadOptions, WriteOptions
 from beam_warp.schema.files import unaligned_files
 from beam_warp.schema.reader import read_asset
 from beam_warp.schema.stage_queries import open_asset, stage_axes, stage_meters
-from beam_warp.schema.writer import write_asset
+from beam_warp.schema.writer import WrittenClips, write_asset
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
@@ -54,20 +54,30 @@ class _Overruled:
         return change_axes(cloud, cloud.axes, scale=self.scale).with_arrays(axes=self.axes)
 
 
-def write(sequence: GaussianSequence, path: Path, options: WriteOptions) -> list[Path]:
-    """Write an asset, y up and in metres."""
+def write(
+    sequence: GaussianSequence, path: Path, options: WriteOptions, clips: WrittenClips | None = None
+) -> list[Path]:
+    """Write an asset, y up and in metres, or complete one whose clips are written."""
+    return write_asset(
+        prepared(sequence, options.sh_degree),
+        path,
+        full_float=options.full_float,
+        lighting_variants=options.lighting_variants,
+        clips=clips,
+    )
+
+
+def prepared(sequence: GaussianSequence, sh_degree: int | None = None) -> GaussianSequence:
+    """Return a sequence as it is written: y up, with radiance of a degree."""
     axes = IMPORTERS["usd"].axes
 
     @lru_cache(maxsize=1)  # a writer asks for the first frame more than once
-    def prepared(frame: int) -> GaussianCloud:
+    def read(frame: int) -> GaussianCloud:
         cloud = change_axes(sequence[frame], axes)
-        if cloud.radiance is None or options.sh_degree is None:
+        if cloud.radiance is None or sh_degree is None:
             return cloud
-        return cloud.with_arrays(radiance=resize_bands(cloud.radiance, options.sh_degree))
+        return cloud.with_arrays(radiance=resize_bands(cloud.radiance, sh_degree))
 
     # Notes tell of the reading of another file; in this asset they would be told again of a file that is sound.
     provenance = {key: value for key, value in sequence.metadata.items() if key != "notes"}
-    prepared_sequence = dataclasses.replace(sequence, read_frame=prepared, metadata=provenance)
-    return write_asset(
-        prepared_sequence, path, full_float=options.full_float, lighting_variants=options.lighting_variants
-    )
+    return dataclasses.replace(sequence, read_frame=read, metadata=provenance)

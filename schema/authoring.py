@@ -89,15 +89,16 @@ class AssetContents:
             total += rows * terms * CHANNELS[name].columns * width
         return total
 
-    def frames(self) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
-        """Yield every frame's number and arrays in order, as they are stored.
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
+        """Yield number and arrays of frames in order, all or some, as they are stored.
 
         With constant topology, a quaternion takes the sign that is nearer to its predecessor: engines that blend
-        components would otherwise spin the Gaussian.
+        components would otherwise spin the Gaussian. So only all frames of such a sequence can be asked for.
         """
+        assert start == 0 or self.sequence.topology != "constant"
         keep_signs = self.sequence.topology == "constant" and "orientations" in self.survey.varying
         previous: NDArray[Any] | None = None
-        for frame in range(len(self.sequence)):
+        for frame in range(len(self.sequence))[start:stop]:
             arrays = self.stored(self.sequence[frame], self.varying)
             if keep_signs:
                 current = arrays["orientations"]

@@ -1,17 +1,20 @@
 """First pass over a sequence, before it is written: which arrays exist, which vary, and which precision is safe.
 
 OpenUSD needs these answers before the first frame: an attribute has one precision and one spherical-harmonics degree,
-and is either constant or sampled. The pass holds two frames at a time, so memory does not grow with their number.
+and is either constant or sampled. The pass holds one frame at a time. Parts of a sequence may be surveyed by several
+processes, for surveys of parts add up.
 """
 
 from __future__ import annotations
 
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
 from beam_warp.schema.layout import CHANNELS, UP_AXES
@@ -43,6 +46,93 @@ class Survey:
     color_space: str
     sh_degree: int
 
+    @classmethod
+    def of(cls, found: FramesSurvey, sequence: GaussianSequence) -> Survey:
+        """Return the properties of a sequence, given those of all its frames.
+
+        Raises:
+            InvalidOptionError: A stage cannot state the axes, or the count changes although the topology is constant.
+        """
+        require_upright(found.axes)
+        same_count = _have_one_count(found.counts, sequence)
+        return cls(
+            axes=found.axes,
+            counts=found.counts,
+            names=tuple(name for name in CHANNELS if name in found.digests),
+            varying=frozenset(found.varying - (sequence.constant if same_count else set())),
+            half=frozenset(
+                name for name in found.digests if CHANNELS[name].half_is_safe(found.largest[name], found.smallest[name])
+            ),
+            captured=found.captured,
+            color_space=found.color_space or DISPLAY_SRGB,
+            sh_degree=found.sh_degree,
+        )
+
+
+@dataclass(frozen=True)
+class FramesSurvey:
+    """Properties of some frames in a row, from which those of a whole sequence follow; see `Survey.of`.
+
+    Attributes:
+        axes: Axes code of the frames.
+        color_space: Colour space of their radiance; None for the default.
+        captured: Whether they have captured radiance.
+        counts: Number of Gaussians in each frame.
+        sh_degree: Highest degree of ``radiance``.
+        digests: Digest of each array that is the same in all of these frames, empty for the others.
+        largest: Largest magnitude in each array.
+        smallest: Smallest magnitude other than 0 in each array whose small values count, else infinity.
+    """
+
+    axes: str
+    color_space: str | None
+    captured: bool
+    counts: tuple[int, ...]
+    sh_degree: int
+    digests: Mapping[str, str]
+    largest: Mapping[str, float]
+    smallest: Mapping[str, float]
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud, undigested: Container[str] = ()) -> FramesSurvey:
+        """Return the properties of one frame; arrays that are known to vary need no digest."""
+        arrays = stored_arrays(cloud)
+        ranges = {name: _magnitudes(name, array) for name, array in arrays.items()}
+        return cls(
+            axes=cloud.axes,
+            color_space=cloud.radiance_color_space,
+            captured=cloud.radiance is not None,
+            counts=(len(cloud),),
+            sh_degree=cloud.sh_degree or 0,
+            digests={name: "" if name in undigested else array_digest(array) for name, array in arrays.items()},
+            largest={name: largest for name, (largest, _) in ranges.items()},
+            smallest={name: smallest for name, (_, smallest) in ranges.items()},
+        )
+
+    def __add__(self, other: FramesSurvey) -> FramesSurvey:
+        """Return the properties of these frames and those that follow.
+
+        Raises:
+            InvalidOptionError: They differ in axes or colour space.
+            InvalidArrayError: They differ in which arrays they hold.
+        """
+        _require_same_kind(self, other)
+        return FramesSurvey(
+            axes=self.axes,
+            color_space=self.color_space,
+            captured=self.captured,
+            counts=self.counts + other.counts,
+            sh_degree=max(self.sh_degree, other.sh_degree),
+            digests={name: it if it == other.digests[name] else "" for name, it in self.digests.items()},
+            largest={name: max(it, other.largest[name]) for name, it in self.largest.items()},
+            smallest={name: min(it, other.smallest[name]) for name, it in self.smallest.items()},
+        )
+
+    @property
+    def varying(self) -> set[str]:
+        """Names of the arrays that are not the same in all of these frames."""
+        return {name for name, digest in self.digests.items() if not digest}
+
 
 def survey_sequence(sequence: GaussianSequence) -> Survey:
     """Read every frame once and return the properties of the sequence.
@@ -52,40 +142,31 @@ def survey_sequence(sequence: GaussianSequence) -> Survey:
             although the topology is constant.
         InvalidArrayError: Frames differ in which arrays they hold.
     """
-    first = sequence[0]
-    if first.axes not in UP_AXES:
+    found = FramesSurvey.of(sequence[0])
+    require_upright(found.axes)
+    for frame in range(1, len(sequence)):
+        found += FramesSurvey.of(sequence[frame], found.varying | sequence.constant)
+    return Survey.of(found, sequence)
+
+
+def require_upright(axes: str) -> None:
+    """Refuse axes that a stage cannot state.
+
+    Raises:
+        InvalidOptionError: It cannot.
+    """
+    if axes not in UP_AXES:
         raise InvalidOptionError(
-            f"axes must be rub (y up) or rfu (z up) in a USD asset, got {first.axes!r}. Convert the axes first."
+            f"axes must be rub (y up) or rfu (z up) in a USD asset, got {axes!r}. Convert the axes first."
         )
-    held = stored_arrays(first)
-    counts, varying, degree = [], set(), 0
-    largest = dict.fromkeys(held, 0.0)
-    smallest = dict.fromkeys(held, np.inf)
-    for frame in range(len(sequence)):
-        cloud = first if frame == 0 else sequence[frame]
-        _require_same_kind(sequence, frame, cloud, first)
-        counts.append(len(cloud))
-        arrays = held if frame == 0 else stored_arrays(cloud)
-        degree = max(degree, cloud.sh_degree or 0)
-        for name, array in arrays.items():
-            if frame and name in sequence.constant and len(array) == len(held[name]):
-                continue
-            if frame and name not in varying and not np.array_equal(array, held[name]):
-                varying.add(name)
-            if array.dtype.kind == "f" and array.size:
-                largest[name] = max(largest[name], float(array.max()), -float(array.min()))
-                if CHANNELS[name].relative:
-                    smallest[name] = min(smallest[name], float(np.abs(array[array != 0]).min(initial=np.inf)))
-    return Survey(
-        axes=first.axes,
-        counts=tuple(counts),
-        names=tuple(name for name in CHANNELS if name in held),
-        varying=frozenset(varying),
-        half=frozenset(name for name in held if CHANNELS[name].half_is_safe(largest[name], smallest[name])),
-        captured=first.radiance is not None,
-        color_space=first.radiance_color_space or DISPLAY_SRGB,
-        sh_degree=degree,
-    )
+
+
+def _magnitudes(name: str, array: NDArray[Any]) -> tuple[float, float]:
+    """Return the largest magnitude of an array, and the smallest other than 0 if small values count."""
+    if array.dtype.kind != "f" or not array.size:
+        return 0.0, np.inf
+    smallest = float(np.abs(array[array != 0]).min(initial=np.inf)) if CHANNELS[name].relative else np.inf
+    return max(0.0, float(array.max()), -float(array.min())), smallest
 
 
 def stored_arrays(cloud: GaussianCloud) -> dict[str, NDArray[Any]]:
@@ -126,23 +207,33 @@ def _fallback_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:
     return ((linear_to_srgb(color) - 0.5) / SH_C0).astype(np.float32)[:, None, :]
 
 
-def _require_same_kind(sequence: GaussianSequence, frame: int, cloud: GaussianCloud, first: GaussianCloud) -> None:
-    """Refuse a frame that cannot be stored in the same prim as frame 0."""
-    names, wanted_names = set(cloud.arrays()), set(first.arrays())
-    if names != wanted_names:
+def _require_same_kind(first: FramesSurvey, other: FramesSurvey) -> None:
+    """Refuse frames that cannot be stored in the same prim as those before them."""
+    frame = len(first.counts)
+    if first.digests.keys() != other.digests.keys() or first.captured != other.captured:
+        names = {"radiance"} if first.captured != other.captured else set()
+        names |= first.digests.keys() ^ other.digests.keys()
         raise InvalidArrayError(
-            f"frames must hold the same arrays, got a difference in {', '.join(sorted(names ^ wanted_names))} "
-            f"at frame {frame}. Fill or drop these arrays everywhere."
+            f"frames must hold the same arrays, got a difference in {', '.join(sorted(names))} at frame {frame}. "
+            "Fill or drop these arrays everywhere."
         )
-    for label in ("axes", "radiance_color_space"):
-        got, wanted = getattr(cloud, label), getattr(first, label)
+    for label, wanted, got in (
+        ("axes", first.axes, other.axes),
+        ("radiance_color_space", first.color_space, other.color_space),
+    ):
         if got != wanted:
             raise InvalidOptionError(
                 f"{label} must be the same in every frame, got {got!r} after {wanted!r} at frame {frame}. "
                 "Convert the frames to one form."
             )
-    if len(cloud) != len(first) and (sequence.topology == "constant" or "positions" in sequence.constant):
+
+
+def _have_one_count(counts: tuple[int, ...], sequence: GaussianSequence) -> bool:
+    """Return whether all frames have as many Gaussians, which a constant topology demands."""
+    frame = next((frame for frame, count in enumerate(counts) if count != counts[0]), None)
+    if frame is not None and (sequence.topology == "constant" or "positions" in sequence.constant):
         raise InvalidOptionError(
-            f"topology must be perFrame where counts change, got {len(cloud)} Gaussians after {len(first)} at frame "
+            f"topology must be perFrame where counts change, got {counts[frame]} Gaussians after {counts[0]} at frame "
             f"{frame}. Build the sequence with topology='perFrame' and no constant arrays."
         )
+    return frame is None

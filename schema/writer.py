@@ -6,13 +6,19 @@ SPEC.md describes the files; `beam_warp.schema.authoring` makes the contents of 
 from __future__ import annotations
 
 import re
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
+from numpy.typing import NDArray
 from pxr import Sdf
 
 from beam_warp.checks import require_count, require_path
 from beam_warp.errors import InvalidOptionError, OutputError
+from beam_warp.outputs import replacing
 from beam_warp.schema import register
 from beam_warp.schema.authoring import (
     AssetContents,
@@ -28,13 +34,16 @@ from beam_warp.schema.authoring import (
 )
 from beam_warp.schema.layout import ASSET_PATH, SPLATS_PATH
 from beam_warp.schema.staging import publish_asset, staged_folder
-from beam_warp.schema.survey import survey_sequence
+from beam_warp.schema.survey import Survey, survey_sequence
 from beam_warp.world.gaussians import GaussianSequence
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 
 MAX_FRAMES_IN_ONE_LAYER = 60
 """Most frames of a ``.usda`` or ``.usdz`` asset without value clips."""
+
+CLIP_FRAMES = 30
+"""Frames in one value clip."""
 
 USDZ_LIMIT = 2**32
 """Size that an archive must stay below [byte], since OpenUSD does not read ZIP64."""
@@ -46,7 +55,8 @@ def write_asset(
     *,
     full_float: bool = False,
     lighting_variants: bool = False,
-    segment_length: int = 30,
+    segment_length: int = CLIP_FRAMES,
+    clips: WrittenClips | None = None,
 ) -> list[Path]:
     """Write a relightable 4D Gaussian asset.
 
@@ -67,6 +77,7 @@ def write_asset(
             selected, is the asset as it is without the set. In the variant ``albedo``, the radiance is the base colour,
             for renderers that light Gaussians and take their radiance for albedo. Not for ``.usdc``.
         segment_length: Frames in one value clip, and held in memory at once.
+        clips: Clips of this sequence that `write_clip` has written; None to write all here.
 
     Returns:
         The files written, the one to open last.
@@ -84,7 +95,7 @@ def write_asset(
         )
     require_count("segment_length", segment_length)
     register()
-    survey = survey_sequence(sequence)
+    survey = survey_sequence(sequence) if clips is None else clips.survey
     half = frozenset() if full_float else survey.half
     clipped = len(sequence) > MAX_FRAMES_IN_ONE_LAYER and bool(survey.varying) and target.suffix != ".usdc"
     contents = AssetContents(sequence, survey, half, segment_length if clipped else 0)
@@ -93,7 +104,7 @@ def write_asset(
     with staged_folder(target) as folder:
         root = f"{target.stem}.plain.usda" if lighting_variants else f"{target.stem}.usda"
         if clipped:
-            names = _write_clips(contents, folder, target.stem, root)
+            names = _write_clips(contents, folder, target.stem, root, clips)
         elif target.suffix == ".usda" or lighting_variants:
             names = _write_text_and_data(contents, folder, target.stem, root, segment_length)
         else:
@@ -124,23 +135,74 @@ def _write_text_and_data(contents: AssetContents, folder: Path, stem: str, root:
     return [*names, _write_root(contents, folder, stem, root, data, [])]
 
 
-def _write_clips(contents: AssetContents, folder: Path, stem: str, root: str) -> list[str]:
+@dataclass(frozen=True)
+class WrittenClips:
+    """Clips of a long sequence that were written one by one, by `write_clip`.
+
+    Attributes:
+        survey: Properties of the sequence.
+        folder: Where they are, under the names that they have in the asset.
+    """
+
+    survey: Survey
+    folder: Path
+
+
+def clip_name(stem: str, start: int) -> str:
+    """Return the name of the clip that begins with a frame."""
+    return f"{stem}.{start:06d}.usdc"
+
+
+def write_clip(sequence: GaussianSequence, survey: Survey, start: int, path: Path) -> None:
+    """Write one clip of an asset that `write_asset` then completes, the same bytes that it would write.
+
+    Args:
+        sequence: As for `write_asset`, but its topology is not constant.
+        survey: Properties of the sequence.
+        start: The clip's first frame, a multiple of `CLIP_FRAMES`.
+        path: The file, named by `clip_name`.
+
+    Raises:
+        OutputError: It cannot be written; nothing is left behind.
+    """
+    register()
+    contents = AssetContents(sequence, survey, survey.half, CLIP_FRAMES)
+    with replacing(path) as temporary:
+        _write_clip(contents, contents.frames(start, start + CLIP_FRAMES), temporary)
+
+
+def _write_clip(contents: AssetContents, frames: Iterable[tuple[int, Mapping[str, NDArray[Any]]]], path: Path) -> None:
+    layer = _clip_layer(contents, path)
+    for frame, arrays in frames:
+        author_frame(layer, contents, frame, arrays)
+    _save(layer)
+
+
+def _write_clips(
+    contents: AssetContents, folder: Path, stem: str, root: str, written: WrittenClips | None = None
+) -> list[str]:
     """Write a text root layer, a binary layer of constant arrays, a manifest, and a binary layer for each segment."""
     _save(static_layer(contents, folder / f"{stem}.static.usdc"))
     _save(_clip_layer(contents, folder / f"{stem}.manifest.usda"))
-    segments: list[tuple[int, str]] = []
+    starts = range(0, len(contents.sequence), contents.segment_length)
+    segments = [(start, clip_name(stem, start)) for start in starts]
     frames = contents.frames()
-    for start in range(0, len(contents.sequence), contents.segment_length):
-        name = f"{stem}.{start:06d}.usdc"
-        layer = _clip_layer(contents, folder / name)
-        for frame, arrays in islice(frames, contents.segment_length):
-            author_frame(layer, contents, frame, arrays)
-        _save(layer)
-        del layer  # frees the segment: a layer lives as long as somebody holds it
-        segments.append((start, name))
+    for _, name in segments:
+        if written is None:
+            _write_clip(contents, islice(frames, contents.segment_length), folder / name)
+        else:
+            _link(written.folder / name, folder / name)
     data = [name for _, name in segments]
     _write_root(contents, folder, stem, root, f"{stem}.static.usdc", segments)
     return [f"{stem}.static.usdc", f"{stem}.manifest.usda", *data, root]
+
+
+def _link(source: Path, target: Path) -> None:
+    """Give a file a second name; where the file system has no such thing, copy it."""
+    try:
+        target.hardlink_to(source)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def _write_variants(contents: AssetContents, folder: Path, stem: str, plain: str, save_every: int) -> list[str]:

@@ -18,6 +18,7 @@ from typing import Any
 from beam_warp.capture.capture import CaptureRecord
 from beam_warp.digests import content_digest, described, fields_of
 from beam_warp.errors import MissingFileError, OutputError
+from beam_warp.image.film import is_film
 from beam_warp.outputs import replacing
 
 UNREAD_FIELDS = frozenset({"truth_path", "relit_paths"})
@@ -30,6 +31,7 @@ class CaptureDigests:
     def __init__(self, folder: Path) -> None:
         """Keep the memory in a folder, which must exist."""
         self._folder = folder
+        self._films: dict[str, list[Any]] = {}  # hold many frames, and are read once for all of them
 
     def of(self, frame: int, records: Sequence[CaptureRecord], pool: Executor) -> str:
         """Return the digest of one frame's records, in their order; the pool reads the files.
@@ -39,9 +41,11 @@ class CaptureDigests:
         """
         memory = self._folder / f"frame_{frame:06d}.json"
         known = _remembered(memory)
+        told = {**known, **self._films}
         paths = sorted({path for record in records for path in files_of(record)})
-        found = dict(zip(paths, pool.map(lambda path: content_digest(path, known), paths), strict=True))
+        found = dict(zip(paths, pool.map(lambda path: content_digest(path, told), paths), strict=True))
         fresh = {str(path): [*stamp, digest] for path, (stamp, digest) in found.items() if stamp is not None}
+        self._films |= {name: entry for name, entry in fresh.items() if is_film(Path(name))}
         if fresh != known:
             _remember(memory, fresh)
         content = [

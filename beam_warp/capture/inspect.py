@@ -25,6 +25,7 @@ from beam_warp.capture.rigs import up_direction
 from beam_warp.checks import require_count
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.files import image_size
+from beam_warp.image.film import film_of, is_film
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.world.camera import Camera
 
@@ -220,7 +221,7 @@ def _judge_files(capture: Capture, findings: Findings) -> set[str]:
             if path is None:
                 continue
             try:
-                size = image_size(path)
+                size = film_of(path).size if is_film(path) else image_size(path)
                 if size != expected:
                     sizes[what].append((record, f"{size[0]} x {size[1]} for {expected[0]} x {expected[1]}"))
             except BeamError as error:

@@ -6,8 +6,11 @@ fitted to pixels that are surely outside, or an image of the empty scene and suc
 I = a F + (1 - a) B, then shows the coverage a = (I - B).(F - B) / |F - B|². The sum of the mask minus a, over the
 length of the outline, is how far the mask reaches beyond the subject, whether the outline is soft or hard.
 
-How much F and B scatter about their functions says how far to trust that. A mask is moved by what is beyond doubt
-alone: an exact one stays as it is, and where subject and backdrop look alike nothing is known. Then the most likely
+How much F and B scatter about their functions, and change over the pixels from which they are extrapolated, says how
+far to trust that. A mask is moved by what is beyond doubt alone: an exact one stays as it is, and where subject and
+backdrop look alike nothing is known. Most of what is wrong with a mask is so all along its outline; where a part of it
+seems to be off by more, the mask may be wrong there, or the subject be dark towards its limb, before a dark backdrop.
+What is between the two outlines is told as a doubt, and left to other views. Then the most likely
 colours of subject and backdrop whose sum is the pixel (Chuang et al. 2001, "A Bayesian Approach to Digital Matting")
 give the subject's part: I - (1 - a) B before a smooth backdrop, a F before a cluttered one.
 """
@@ -110,11 +113,13 @@ class Matte:
         color: Scene-linear, premultiplied by coverage, ``(H, W, 3)`` float32.
         alpha: Coverage in [0, 1], ``(H, W)`` float32.
         offset: How far the given mask reaches beyond the subject; None where the photograph does not tell.
+        doubt: How much is not known of a pixel, 0 to 1, ``(H, W)`` float32: coverage and colour are a guess there.
     """
 
     color: NDArray[np.float32]
     alpha: NDArray[np.float32]
     offset: MaskOffset | None
+    doubt: NDArray[np.float32]
 
 
 def matte(
@@ -132,7 +137,7 @@ def matte(
     """
     outline = _outline(mask)
     if outline is None:
-        return Matte(photograph * mask[..., None], mask, None)
+        return Matte(photograph * mask[..., None], mask, None, np.zeros_like(mask))
     at = tuple(outline.near.T)
     empty = np.float32(0.0) if plate is None else plate
     seen = np.clip(photograph, -BRIGHTEST, BRIGHTEST)
@@ -141,17 +146,19 @@ def matte(
     for margin in np.add(MARGINS, softness):
         distance = outline.distances + excess[outline.nearest]
         place = outline.everywhere(distance)
-        inner = _fit(seen, outline, place < -margin)
-        outer = _fit(seen - empty, outline, place > margin)
+        inner = _fit(seen, outline, place < -margin, margin)
+        outer = _fit(seen - empty, outline, place > margin, margin)
         outer.values += np.broadcast_to(empty, photograph.shape)[at]
         shown = _coverage(seen[at], inner.values, outer.values)
         shown = np.where(np.abs(distance) <= margin, shown, distance < 0.0)
         excess, error = _excess(outline, mask[at], shown, inner, outer)
-    offset, moves = _believed(excess, error)
-    alpha = _moved(mask, outline, moves)
+    offset, common, own = _believed(excess, error)
+    whole = _moved(mask, outline, np.full(len(own), common))
+    parts = _moved(mask, outline, common + own) if own.any() else whole
+    alpha = 0.5 * (whole + parts)
     color = photograph * alpha[..., None]
     color[at] = _subject(seen[at], alpha[at], inner, outer, outline.nearest)
-    return Matte(color, alpha, offset)
+    return Matte(color, alpha, offset, np.abs(whole - parts))
 
 
 def moved_mask(mask: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
@@ -274,13 +281,18 @@ def _softness(mask: NDArray[np.float32], distances: NDArray[np.float64]) -> floa
     return max(float(np.quantile(soft, 0.9)) - 1.0, 0.0) if len(soft) else 0.0
 
 
-def _fit(image: NDArray[np.float32], outline: _Outline, sure: NDArray[np.bool_]) -> _Colors:
-    """Fit linear functions of the position to the sure pixels of an image around each point of an outline."""
+def _fit(image: NDArray[np.float32], outline: _Outline, sure: NDArray[np.bool_], margin: float) -> _Colors:
+    """Fit linear functions of the position to the sure pixels of an image around each point of an outline.
+
+    Between these and the outline, over the margin, slopes across the outline may change by as much as they are.
+    """
     blocks = [
         _fit_block(image, outline.points[start : start + BLOCK], sure) for start in range(0, len(outline.points), BLOCK)
     ]
     coefficients, variances = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     ways = (outline.near - outline.points[outline.nearest]).astype(np.float64)
+    across = (coefficients[:, 1:] * outline.normals[:, :, None]).sum(axis=1)
+    variances += margin**2 * np.square(across).mean(axis=1)
     of = coefficients[outline.nearest]
     return _Colors(of[:, 0] + ways[:, :1] * of[:, 1] + ways[:, 1:] * of[:, 2], variances)
 
@@ -351,16 +363,19 @@ def _sharpened(coverage: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.clip((coverage.astype(np.float64) - LITTLE) / (1.0 - 2.0 * LITTLE), 0.0, 1.0)
 
 
-def _believed(excess: NDArray[np.float64], error: NDArray[np.float64]) -> tuple[MaskOffset | None, NDArray[np.float64]]:
-    """Return the offset of a mask as a whole, and by how much to take it in at each point: what is beyond doubt."""
+def _believed(
+    excess: NDArray[np.float64], error: NDArray[np.float64]
+) -> tuple[MaskOffset | None, float, NDArray[np.float64]]:
+    """Return the offset of a mask, by how much to take all of it in, and each point beside that: what is beyond doubt."""
     weights = 1.0 / error**2
     middle = _median(excess, weights)
     spread = max(1.4826 * _median(np.abs(excess - middle), weights), _median(error, weights))
     independent = weights.sum() ** 2 / (weights**2).sum() / NEIGHBORS
     of_all = float(np.hypot(LEAST_ERROR, 1.2533 * spread / np.sqrt(max(independent, 1.0))))  # 1.2533: of a median
     if not of_all <= WORST_ERROR:
-        return None, np.zeros_like(excess)
-    return MaskOffset(middle, of_all), _beyond(np.array(middle), np.array(of_all)) + _beyond(excess - middle, error)
+        return None, 0.0, np.zeros_like(excess)
+    common = float(_beyond(np.array(middle), np.array(of_all)))
+    return MaskOffset(middle, of_all), common, _beyond(excess - middle, error)
 
 
 def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:

@@ -9,7 +9,8 @@ for measuring errors, ``truth`` and ``relit``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from beam_warp.checks import is_text
 from beam_warp.converters.ply.container import read_columns, read_header
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.color import srgb_to_linear
+from beam_warp.image.film import film_times, is_film
 from beam_warp.world.camera import OPENGL_TO_OPENCV
 
 FILE_NAME = "transforms.json"
@@ -66,30 +68,56 @@ def read(path: Path, keep: float) -> CaptureContents:
         for name in _Fields(content, str(path)).texts(f"{split}_filenames")
     }
     shared = {name: content[name] for name in _SHARED_NAMES if name in content}
-    records, seen = [], {}
+    records, seen, fields = [], {}, _Fields(content, str(path))
+    rate = fields.number("fps", low=1e-3, high=1e6) if "fps" in content else None
     for index, entry in enumerate(listed):
         where = f"{path}, frames[{index}]"
         if not isinstance(entry, dict):
             raise AssetFormatError(f"record must be an object, got {_shown(entry)} at {where}. Write it as one.")
-        record = _record(_Fields({**shared, **entry}, where), root, splits, keep)
-        if record.name in seen:
-            raise AssetFormatError(
-                f"camera and frame must be another pair in each record, got {record.name} "
-                f"at {where} and frames[{seen[record.name]}]. Number the frames or name the cameras apart."
-            )
-        seen[record.name] = index
-        records.append(record)
-    fields = _Fields(content, str(path))
+        named = _Fields({**shared, **entry}, where)
+        first = _record(named, root, splits, keep)
+        rate = _rate_of(first.image_path) if rate is None and is_film(first.image_path) else rate
+        for record in [first] if rate is None or not is_film(first.image_path) else _shots(first, named, rate):
+            if record.name in seen:
+                raise AssetFormatError(
+                    f"camera and frame must be another pair in each record, got {record.name} "
+                    f"at {where} and frames[{seen[record.name]}]. Number the frames or name the cameras apart."
+                )
+            seen[record.name] = index
+            records.append(record)
     environment = root / fields.text("environment", "environment.exr")
     if "environment" in content and not environment.is_file():
         raise MissingFileError(f"environment must be a file, got {environment} (named in {path}). Correct the name.")
     return CaptureContents(
         folder=root,
         records=tuple(records),
-        frames_per_second=fields.number("fps", low=1e-3, high=1e6) if "fps" in content else None,
+        frames_per_second=rate,
         environment_path=environment if environment.is_file() else None,
         read_points=partial(read_points, root / fields.text("ply_file_path")) if "ply_file_path" in content else None,
     )
+
+
+def _rate_of(path: Path) -> float | None:
+    """Return the rate of a video [1/s]; None for one of a single frame."""
+    times = film_times(path)
+    return 1.0 / float(np.median(np.diff(times))) if len(times) > 1 else None
+
+
+def _shots(record: CaptureRecord, fields: _Fields, rate: float) -> Iterator[CaptureRecord]:
+    """Yield a record for each frame of a video, or for the one that is stated: those that it shows at the right time.
+
+    Frame k is what is shown nearest to k frames' time after ``video_start``, the time of the first frame; where nothing
+    is within half a frame of that, the camera has dropped the frame, and there is no record.
+    """
+    times = film_times(record.image_path)
+    start = fields.number("video_start", float(times[0]), low=-1e6, high=1e6)
+    stated = fields.values.get("frame") is not None
+    count = max(int((times[-1] - start) * rate + 1.5), 0)
+    for frame in [record.frame] if stated else range(min(count, MAX_RECORDS)):
+        due = start + frame / rate
+        moment = float(times[np.argmin(np.abs(times - due))])
+        if abs(moment - due) <= 0.5 / rate:
+            yield replace(record, frame=frame, time=frame / rate, moment=moment)
 
 
 def read_points(path: Path) -> SparsePoints:

@@ -26,6 +26,7 @@ from scipy.ndimage import convolve, map_coordinates
 from beam_warp.capture.records import CaptureRecord
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.files import quantization_error
+from beam_warp.image.film import is_film
 
 SOLID = 0.5
 """The outline runs where coverage passes this value."""
@@ -108,7 +109,7 @@ def quality_of(record: CaptureRecord, view: CapturedView) -> ImageQuality:
     Raises:
         MissingFileError, AssetFormatError: The image cannot be read any more.
     """
-    loss = quantization_error(record.image_path)
+    loss = 0.0 if is_film(record.image_path) else quantization_error(record.image_path)
     if view.alpha is None:
         solid = np.ones(view.color.shape[:2], bool)
         return ImageQuality((np.nan, np.nan), _relative_noise(view.color, solid), loss, by_coverage=False)

@@ -22,6 +22,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.image.files import SUFFIXES, Image, read_image
+from beam_warp.image.film import is_film, read_film_frame
 from beam_warp.world.camera import Camera
 
 MAX_CONTAINERS = 2**21
@@ -38,6 +39,9 @@ ALPHA_ROUNDING = 2.0**-10
 
 COLOR_SPACES = {"srgb": DISPLAY_SRGB, "linear": LINEAR_REC709}
 """Values of ``color_space`` in a capture's files; without one, the convention of each image format holds."""
+
+DOUBT = "coverage.doubt"
+"""Channel of a photograph that says how much is not known of a pixel."""
 
 IMAGE_FOLDER = "images"
 MASK_FOLDER = "masks"
@@ -70,14 +74,15 @@ class CaptureRecord:
         time: When the image was taken [s].
         split: Purpose of the image: ``train``, ``test``, ….
         camera: Pinhole camera of `image`.
-        image_path: The image file, as photographed.
-        mask_path: An image file, as photographed, that is white on the subject; None if there is none.
+        image_path: The image file, as photographed; or a video.
+        mask_path: An image file, as photographed, that is white on the subject, or a video; None if there is none.
         plate_path: An image file of the same camera, as photographed, without the subject; None if there is none.
         color_space: Colour space of the files, `LINEAR_REC709` or `DISPLAY_SRGB`; None for the format's convention.
         truth_path: An EXR of exact channels, if the capture is synthetic.
         relit_paths: Exact images under other lights, by the name of the light.
         undistortion: Undistortion of all files as they are read; None if a pinhole took them.
         mask_excess: How far coverage reaches beyond the subject [pixel of `view`], which is taken in as it is read.
+        moment: When videos show the image, on the clock of their files [s].
         gains: Factors of red, green and blue that the camera is known to be off by; `view` undoes them.
     """
 
@@ -94,6 +99,7 @@ class CaptureRecord:
     relit_paths: Mapping[str, Path] = field(default_factory=dict)
     undistortion: Undistortion | None = None
     mask_excess: float = 0.0
+    moment: float = 0.0
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
@@ -119,7 +125,7 @@ class CaptureRecord:
             MissingFileError: It is not there.
             AssetFormatError: It is damaged, or its size is not the camera's.
         """
-        return self._undistorted(self._photograph())
+        return self._undistorted(self.photograph())
 
     def view(self) -> CapturedView:
         """Read the image for reconstruction: scene-linear colour, undistorted, and coverage of the subject.
@@ -134,8 +140,8 @@ class CaptureRecord:
             MissingFileError: The image, or the mask or plate that the capture names, does not exist.
             AssetFormatError: A file is damaged, not of the camera's size, or holds values that no image has.
         """
-        image, offset = self._photograph(), None
-        mask = None if self.mask_path is None else _coverage(self._sized(read_image(self.mask_path), "mask"))
+        image, offset = self.photograph(), None
+        mask = None if self.mask_path is None else _coverage(self._sized(self._read(self.mask_path), "mask"))
         if (scene := _scene(image)) is not None:
             if image.alpha is not None and not _is_opaque(image.alpha):
                 mask = image.alpha if mask is None else image.alpha * mask
@@ -160,7 +166,15 @@ class CaptureRecord:
         color = rgba[..., :3]
         if self.gains != (1.0, 1.0, 1.0):
             color = color / np.array(self.gains, np.float32)
-        found = CapturedView(name=self.name, camera=self.camera, color=color, alpha=alpha, mask_offset=offset)
+        doubt = image.channels.get(DOUBT)
+        found = CapturedView(
+            name=self.name,
+            camera=self.camera,
+            color=color,
+            alpha=alpha,
+            doubt=doubt if doubt is not None and doubt.any() else None,
+            mask_offset=offset,
+        )
         return taken_in(found, self.mask_excess)
 
     def truth(self) -> Image:
@@ -188,8 +202,16 @@ class CaptureRecord:
             )
         return self._undistorted(self._sized(read_image(self.relit_paths[light]), "image"))
 
-    def _photograph(self) -> Image:
-        return self._sized(read_image(self.image_path, color_space=self.color_space), "image")
+    def photograph(self) -> Image:
+        """Read the image as photographed, distorted as it is; errors are those of `image`."""
+        return self._sized(self._read(self.image_path, self.color_space), "image")
+
+    def _read(self, path: Path, color_space: str | None = None) -> Image:
+        """Read an image file, or the frame of a video, which is sRGB unless the capture says otherwise."""
+        if not is_film(path):
+            return read_image(path, color_space=color_space)
+        image = read_film_frame(path, self.moment)
+        return image if color_space is None else replace(image, color_space=color_space)
 
     def _plate(self) -> NDArray[np.float32] | None:
         """Read the plate, scene-linear."""
@@ -211,7 +233,7 @@ class CaptureRecord:
             return (image if mask is None else _masked(_opaque(image), mask)), None  # as it is, and then refused
         start = keyed(scene, cast("NDArray[np.float32]", plate)) if mask is None else np.clip(mask, 0.0, 1.0)
         found = matte(scene, start, plate)
-        planes = dict(zip("RGBA", [*np.moveaxis(found.color, -1, 0), found.alpha], strict=True))
+        planes = dict(zip([*"RGBA", DOUBT], [*np.moveaxis(found.color, -1, 0), found.alpha, found.doubt], strict=True))
         cut = Image(image.path, planes, LINEAR_REC709, premultiplied=True)
         return cut, None if mask is None else found.offset
 

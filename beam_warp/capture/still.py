@@ -18,7 +18,7 @@ from beam_warp.capture.inspect import SPLIT
 from beam_warp.capture.records import PLATE_FOLDER
 from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.image.files import read_image, write_exr, write_png
+from beam_warp.image.files import write_exr, write_png
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.jobs.store import make_folders
 
@@ -103,7 +103,7 @@ def _written(folder: Path, name: str, records: Sequence[CaptureRecord]) -> Plate
     """Write the plate of one camera."""
     count = min(len(records), MOST_FRAMES)
     chosen = [records[round(place)] for place in np.linspace(0, len(records) - 1, count)]
-    images = [read_image(record.image_path, color_space=record.color_space) for record in chosen]
+    images = [record.photograph() for record in chosen]
     values = np.median(np.stack([image.rgb() for image in images]), axis=0).astype(np.float32)
     is_display = images[0].color_space == DISPLAY_SRGB
     path = folder / f"{name}.{'png' if is_display else 'exr'}"

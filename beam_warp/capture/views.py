@@ -22,6 +22,8 @@ class CapturedView:
         camera: The pinhole that took the image.
         color: Scene-linear Rec.709, premultiplied by ``alpha`` where there is one, ``(H, W, 3)`` float32.
         alpha: Coverage of the subject in [0, 1], ``(H, W)`` float32; None if it is unknown.
+        doubt: How much is not known of a pixel, 0 to 1: its colour and coverage are a guess where a photograph does not
+            tell where the subject ends, ``(H, W)`` float32; None for nothing of any.
         mask_offset: How far the file's mask reached beyond the subject before it was moved; None if nothing tells.
 
     Raises:
@@ -32,6 +34,7 @@ class CapturedView:
     camera: Camera
     color: NDArray[np.float32]
     alpha: NDArray[np.float32] | None = None
+    doubt: NDArray[np.float32] | None = None
     mask_offset: MaskOffset | None = None
 
     def __post_init__(self) -> None:
@@ -40,10 +43,11 @@ class CapturedView:
         color = require_array("color", self.color, (*size, 3))
         require_finite("color", color)
         object.__setattr__(self, "color", color)
-        if self.alpha is not None:
-            alpha = require_array("alpha", self.alpha, size)
-            require_range("alpha", alpha, 0.0, 1.0)
-            object.__setattr__(self, "alpha", alpha)
+        for name in ("alpha", "doubt"):
+            if (value := getattr(self, name)) is not None:
+                part = require_array(name, value, size)
+                require_range(name, part, 0.0, 1.0)
+                object.__setattr__(self, name, part)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> CapturedView:
         """Return a part of the view with its camera.
@@ -62,6 +66,7 @@ class CapturedView:
             camera=self.camera.cropped(left, top, width, height),
             color=np.ascontiguousarray(self.color[part]),
             alpha=None if self.alpha is None else np.ascontiguousarray(self.alpha[part]),
+            doubt=None if self.doubt is None else np.ascontiguousarray(self.doubt[part]),
         )
 
     def reduced(self, factor: int) -> CapturedView:
@@ -90,4 +95,5 @@ class CapturedView:
             camera=self.camera.reduced(factor),
             color=mean(self.color),
             alpha=None if self.alpha is None else mean(self.alpha),
+            doubt=None if self.doubt is None else mean(self.doubt),
         )

@@ -28,7 +28,7 @@ class Command(NamedTuple):
     """One word of ``beam``; its module is imported when the word is used.
 
     Attributes:
-        record: Name of the dataclass of its options, in the module ``beam_warp.cli.<word>``.
+        record: Name of the dataclass of its options, in the module ``beam_warp.cli.<word>``, _ for -.
         line: Description of the command in a line.
     """
 
@@ -37,8 +37,9 @@ class Command(NamedTuple):
 
     def load(self, word: str) -> tuple[type, Callable[[Any], int]]:
         """Return the record of its options, and the function that takes it and returns the exit code."""
-        module = import_module(f"beam_warp.cli.{word}")
-        return getattr(module, self.record), getattr(module, word)
+        name = word.replace("-", "_")
+        module = import_module(f"beam_warp.cli.{name}")
+        return getattr(module, self.record), getattr(module, name)
 
 
 COMMANDS = {
@@ -56,6 +57,7 @@ COMMANDS = {
     "chart": Command("Chart", "Measure error against time on your own data and device."),
     "inspect": Command("Inspect", "Say what is wrong with a capture before hours are spent on it."),
     "plates": Command("Plates", "Tell the subject by what moves, for a capture without masks."),
+    "warm-up": Command("WarmUp", "Compile the kernels that jobs need, so that none of them waits for that."),
     "plan": Command("ShowPlan", "Say how far a long job is: frames done, running, left, failed, and an estimate."),
 }
 

@@ -56,10 +56,11 @@ def lines_of(standing: Standing, workers: int | None) -> list[str]:
     """Return in lines how far a plan is."""
     from beam_warp.plan.page import in_words, left_in_words
 
-    lines = [f"{'stage':10} {'done':>13} {'running':>8} {'failed':>7} {'each':>9}"]
+    width = max(10, *map(len, standing.stages))
+    lines = [f"{'stage':{width}} {'done':>13} {'running':>8} {'failed':>7} {'each':>9}"]
     for stage, found in standing.stages.items():
         done = f"{found.done:,}/{found.total:,}"
-        lines.append(f"{stage:10} {done:>13} {found.running:8} {found.given_up:7} {in_words(found.seconds):>9}")
+        lines.append(f"{stage:{width}} {done:>13} {found.running:8} {found.given_up:7} {in_words(found.seconds):>9}")
     lines += [f"{name}: {worker}, {in_words(age)}" for name, (worker, age) in standing.running.items()]
     lines += [f"{name}: {words[-1]}" for name, words in standing.errors.items()]
     return [*lines, left_in_words(standing, workers)]

@@ -91,6 +91,10 @@ class FrameArchive:
         """Return base colour, its standard error and observability of a frame, as arrays of a cloud."""
         return read_frame(self.solution_path(number))
 
+    def solved(self, number: int) -> GaussianCloud:
+        """Return a frame with base colour of its own."""
+        return self.read(number).cloud.with_arrays(**self.solution(number))
+
     def remove_beyond(self, count: int) -> list[str]:
         """Remove the frames that an earlier, longer sequence left, and say so in a note, if there were any."""
         numbered = ((_STORED.fullmatch(path.name), path) for path in self.folder.iterdir())

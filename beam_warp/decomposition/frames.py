@@ -122,7 +122,7 @@ class ReconstructedFrames:
     @property
     def may_be_constant(self) -> bool:
         """Whether there is one segment alone; in it, tracking may still be lost."""
-        return len(self.work.frames.segments) == 1
+        return self.work.may_be_constant
 
     def step(self, number: int) -> tuple[str, ...]:
         """Return the name of the step that makes a frame."""
@@ -130,14 +130,16 @@ class ReconstructedFrames:
 
     def sequence(self) -> GaussianSequence:
         """Return the frames without looking whether their topology is constant."""
-        return self.work.sequence(is_constant=False)
+        return self._played(self.work.sequence(is_constant=False))
 
     def whole(self) -> GaussianSequence:
         """Return the frames when all are made."""
-        sequence = self.work.sequence(is_constant=None if self.may_be_constant else False)
-        return (
-            sequence if self.frames_per_second is None else replace(sequence, frames_per_second=self.frames_per_second)
-        )
+        return self._played(self.work.sequence())
+
+    def _played(self, sequence: GaussianSequence) -> GaussianSequence:
+        """Return a sequence with the rate that was asked for."""
+        rate = sequence.frames_per_second if self.frames_per_second is None else self.frames_per_second
+        return replace(sequence, frames_per_second=rate)
 
     def capture(self) -> Capture:
         """Return the images, with corrected cameras."""

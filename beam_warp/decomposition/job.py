@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_path
 from beam_warp.converters.numbering import ASSET_NAME
@@ -198,7 +197,7 @@ def _finish(
     relightable = relightable_sequence(plan, solved, persistent=persistent)
     with staged_folder(out / "results") as staged:  # all of them appear, or none
         with log.timer("write asset"):
-            layers = converters.write(relightable, staged / ASSET_NAME)
+            layers = work.clips.write(relightable, staged / ASSET_NAME, receipts)
         with log.timer("overview"):
             work.progress("overview", 0, 1)
             draw_overview(staged / OVERVIEW_NAME, relightable, plan, overview)
@@ -220,6 +219,5 @@ def _solve(work: MaterialWork, plan: JobPlan, made: Measurements) -> tuple[Solve
     if persistent:
         return solve_jointly(plan, frames), persistent
     if work.solves:
-        return take_each(plan, frames, made.clipped), persistent
-    clipped = [solve_frame(plan, frame) for frame in frames]  # tracking was lost in what was planned as one segment
-    return take_each(plan, map(plan.archive.read, range(len(clipped))), clipped), persistent
+        return take_each(plan, made.counts), persistent
+    return take_each(plan, [solve_frame(plan, frame) for frame in frames]), persistent  # tracking was lost

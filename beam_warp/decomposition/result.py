@@ -36,7 +36,7 @@ class Measurements:
         ray_count: Rays of light and occlusion that were traced for the others.
         economy: What fewer rays for some Gaussians have left out, over all frames.
         notes: What a reader of the result should know.
-        clipped: Part of the opacity that was cut at 1, of each frame that was solved by itself.
+        counts: Sums over each frame that was solved by itself; see `beam_warp.decomposition.tally.counts_of`.
         roughness: How the last estimate of roughness came about; empty if none was made.
         seconds: By stage, spent by all workers on steps of this call.
         workers: Machines and processes that did the steps.
@@ -46,7 +46,7 @@ class Measurements:
     ray_count: int
     economy: dict[str, Any]
     notes: list[str]
-    clipped: list[float]
+    counts: list[dict[str, Any]]
     roughness: dict[str, Any]
     seconds: dict[str, float]
     workers: list[str]
@@ -67,7 +67,7 @@ class Measurements:
             ray_count=sum(frame.facts["ray_count"] for frame in frames if not frame.is_kept),
             economy=summary([frame.facts["economy"] for frame in frames]),
             notes=list(dict.fromkeys(note for frame in frames for note in frame.facts["notes"])),
-            clipped=[frame.facts.get("clipped", 0.0) for frame in frames],
+            counts=[frame.facts.get("counts", {}) for frame in frames],
             roughness=estimates[-1] if estimates else {},
             seconds=seconds,
             workers=sorted({step.worker for step in steps}),

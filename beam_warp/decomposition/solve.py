@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from beam_warp.decomposition.archive import FrameArchive, MeasuredFrame
 from beam_warp.decomposition.plan import JobPlan
-from beam_warp.decomposition.tally import MaterialTally
+from beam_warp.decomposition.tally import MaterialTally, counts_of
 from beam_warp.materials.base_color import BaseColor, solve_base_color
 from beam_warp.materials.changes import ChangeTest, with_changes
 from beam_warp.materials.direct import ColorEvidence
@@ -41,26 +41,28 @@ class SolvedFrames:
 
 def take(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
     """Take frames of the image path as they are."""
-    tally = MaterialTally()
-    for frame in frames:
-        tally.add(frame, frame.cloud)
-    return SolvedFrames(plan.archive, False, True, tally.summary())
+    counts = (counts_of(frame, frame.cloud) for frame in frames)
+    return SolvedFrames(plan.archive, False, True, _added(counts).summary())
 
 
-def solve_frame(plan: JobPlan, frame: MeasuredFrame) -> float:
-    """Solve a frame by itself, where its Gaussians are those of no other; return the part of the opacity cut at 1."""
+def solve_frame(plan: JobPlan, frame: MeasuredFrame) -> dict[str, Any]:
+    """Solve a frame by itself, where its Gaussians are those of no other; return what `counts_of` says of it."""
     with plan.source.log.timer("solve"):
         solved = _solve(plan, frame, _evidence(frame))
         plan.archive.keep_solution(frame.number, solved)
-    return solved.clipped_part
+    return counts_of(frame, frame.cloud.with_arrays(**solved.arrays()), solved.clipped_part)
 
 
-def take_each(plan: JobPlan, frames: Iterable[MeasuredFrame], clipped: Sequence[float]) -> SolvedFrames:
-    """Take frames that were solved by themselves, given the part of the opacity of each that was cut at 1."""
+def take_each(plan: JobPlan, counts: Iterable[Mapping[str, Any]]) -> SolvedFrames:
+    """Take frames that were solved by themselves, given what `counts_of` says of each."""
+    return SolvedFrames(plan.archive, True, True, _added(counts).summary())
+
+
+def _added(counts: Iterable[Mapping[str, Any]]) -> MaterialTally:
     tally = MaterialTally()
-    for frame, part in zip(frames, clipped, strict=True):
-        tally.add(frame, frame.cloud.with_arrays(**plan.archive.solution(frame.number)), part)
-    return SolvedFrames(plan.archive, True, True, tally.summary())
+    for frame in counts:
+        tally.add(frame)
+    return tally
 
 
 def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
@@ -88,7 +90,7 @@ def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrame
             solved = with_changes(constant, change, _evidence(frame))
             plan.archive.keep_solution(number, solved)
             if number == 0:
-                tally.add(first, first.cloud.with_arrays(**solved.arrays()), constant.clipped_part)
+                tally.add(counts_of(first, first.cloud.with_arrays(**solved.arrays()), constant.clipped_part))
     tally.count_changes(change)
     return SolvedFrames(plan.archive, True, is_varying, tally.summary())
 

@@ -46,31 +46,13 @@ class MaterialTally:
         self._changes: dict[str, float] = {}
         self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
 
-    def add(self, frame: MeasuredFrame, cloud: GaussianCloud, clipped_part: float = 0.0) -> None:
-        """Count one frame: its measurements, its relightable cloud, and the part of the opacity that was cut at 1."""
-        count = len(cloud)
-        assert cloud.observability is not None
-        assert cloud.ambient_occlusion is not None
-        assert cloud.normal_confidence is not None
-        measured = (cloud.observability & np.uint8(Observability.FILLED)) == 0
-        error = 0.0
-        if cloud.base_color_error is not None:
-            error = cloud.base_color_error[measured].mean(axis=1).sum(dtype=np.float64)
-        self._rows += count
-        for name, value in (
-            ("clipped", clipped_part * count),
-            ("from_shape", frame.from_shape.sum()),
-            ("openness", cloud.ambient_occlusion.sum(dtype=np.float64)),
-            ("confidence", cloud.normal_confidence.sum(dtype=np.float64)),
-            ("error", error),
-            ("measured", measured.sum()),
-            ("dropped", frame.report[1]),
-            ("raised", frame.report[2]),
-        ):
-            self._sums[name] = self._sums.get(name, 0.0) + float(value)
-        for flag in Observability:
-            if flag and flag.name:
-                self._flags[flag.name] += int(((cloud.observability & np.uint8(flag)) != 0).sum())
+    def add(self, counts: Mapping[str, Any]) -> None:
+        """Count one frame, given what `counts_of` says of it."""
+        self._rows += counts["rows"]
+        for name, value in counts["sums"].items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+        for name, value in counts["flags"].items():
+            self._flags[name] += value
 
     def count_changes(self, change: ColorChange) -> None:
         """Keep what a test of frames against each other found."""
@@ -91,3 +73,36 @@ class MaterialTally:
             "flags": self._flags,
             **self._changes,
         }
+
+
+def counts_of(frame: MeasuredFrame, cloud: GaussianCloud, clipped_part: float = 0.0) -> dict[str, Any]:
+    """Return sums over one frame, JSON-able.
+
+    Args:
+        frame: Its measurements.
+        cloud: Its relightable cloud.
+        clipped_part: Part of the opacity whose base colour was cut at 1.
+    """
+    assert cloud.observability is not None
+    assert cloud.ambient_occlusion is not None
+    assert cloud.normal_confidence is not None
+    measured = (cloud.observability & np.uint8(Observability.FILLED)) == 0
+    error = 0.0
+    if cloud.base_color_error is not None:
+        error = cloud.base_color_error[measured].mean(axis=1).sum(dtype=np.float64)
+    sums = {
+        "clipped": clipped_part * len(cloud),
+        "from_shape": frame.from_shape.sum(),
+        "openness": cloud.ambient_occlusion.sum(dtype=np.float64),
+        "confidence": cloud.normal_confidence.sum(dtype=np.float64),
+        "error": error,
+        "measured": measured.sum(),
+        "dropped": frame.report[1],
+        "raised": frame.report[2],
+    }
+    flags = (flag for flag in Observability if flag and flag.name)
+    return {
+        "rows": len(cloud),
+        "sums": {name: float(value) for name, value in sums.items()},
+        "flags": {flag.name: int(((cloud.observability & np.uint8(flag)) != 0).sum()) for flag in flags},
+    }

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.converters.clips import ClipWork
+from beam_warp.converters.numbering import ASSET_NAME
 from beam_warp.decomposition.archive import FrameArchive
 from beam_warp.decomposition.capture_images import CaptureImages
 from beam_warp.decomposition.capture_light import CaptureLight, find_light
@@ -38,6 +40,9 @@ from beam_warp.outputs import remove_leftovers
 from beam_warp.plan.steps import Plan, Rank, Step, Task
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
+
+ASSET_STEM = Path(ASSET_NAME).stem
 
 STAGES = ("light", "roughness", "materials")
 
@@ -92,7 +97,25 @@ class MaterialWork:
             before = (material_step(numbers[index - 1]),) if index and self._follows else ()
             inputs = (*shared, *made[index], *before)
             steps.append(Step(material_step(number), "materials", number, inputs, Rank.MATERIALS))
-        return Plan(self.folder, tuple(steps), dict.fromkeys(STAGES, self))
+        return Plan(self.folder, tuple(steps), dict.fromkeys(STAGES, self)).with_steps_of(self.clips.plan())
+
+    @cached_property
+    def clips(self) -> ClipWork:
+        """Steps that write the asset of frames that are solved one by one; others are known when all are measured."""
+        names = self.measured() if self.solves else []
+        return ClipWork(self.folder, ASSET_STEM, self.solved, [(name,) for name in names], self.frames.numbers())
+
+    def solved(self) -> GaussianSequence:
+        """Return the frames that were solved one by one, each to be read when it is done; without metadata."""
+        sequence = self.frames.sequence()
+        return GaussianSequence(
+            frame_count=len(sequence),
+            read_frame=lambda number: self.archive.solved(number),
+            frames_per_second=sequence.frames_per_second,
+            constant=sequence.constant & set(ATTRIBUTES) - {"normals"},
+            topology="perFrame",
+            metadata={},
+        )
 
     @property
     def _may_be_persistent(self) -> bool:
@@ -249,7 +272,7 @@ class MaterialWork:
             self.archive.keep(measured)
         frame.forget()
         if self.solves:
-            facts["clipped"] = solve_frame(self.job, measured)
+            facts["counts"] = solve_frame(self.job, measured)
         return facts | {key: getattr(measurement, key) for key in ("ray_count", "economy", "notes")}
 
     def _roughness(self, frame: SeenFrame, facts: dict[str, Any]) -> Mapping[str, NDArray[np.float32]]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from beam_warp.materials.base_color import BaseColor, least_squares, misfit_error
 from beam_warp.materials.direct import ColorEvidence
@@ -73,6 +72,8 @@ class ChangeTest:
 
     def result(self) -> ColorChange:
         """Test every Gaussian; false discoveries are bounded over all of them (Benjamini and Hochberg 1995)."""
+        from scipy import stats  # is slow to import, and few jobs come here
+
         frames, weights, sums, squares = self._sums
         mean = np.divide(sums, weights, out=np.zeros_like(weights), where=weights > 0.0)
         q = np.maximum(squares - mean * sums, 0.0)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from beam_warp.image.color import LUMINANCE
 from beam_warp.world.environment import EnvironmentMap, texel_directions
@@ -120,7 +120,7 @@ class LightFits:
         count = len(differences)
         deviation = np.sqrt((count - 1) * differences.var())
         # Whichever of the lights fits best by chance.
-        chance = student.ppf(1.0 - CHANCE / len(self.misfits), count - 1) * deviation
+        chance = stdtrit(count - 1, 1.0 - CHANCE / len(self.misfits)) * deviation
         return float((self.misfits[worse] - self.misfits[better]) / max(chance, LEAST_GAIN))
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from beam_warp.materials.light_fits import (
     CHANCE,
@@ -263,7 +263,7 @@ def weaker_explains(shown: LightEvidence, light: NDArray[np.float64]) -> float:
     apart, _ = neighbor_differences(shown, base, parts_of(shown.positions), TURN_NEIGHBORS)
     full, half = apart.reshape(len(apart), 2, 3).sum(axis=2).T
     left_out = np.log(np.maximum(full.sum() - full, 1e-6) / np.maximum(half.sum() - half, 1e-6))
-    chance = student.ppf(1.0 - CHANCE, len(full) - 1) * float(np.sqrt((len(full) - 1) * left_out.var()))
+    chance = stdtrit(len(full) - 1, 1.0 - CHANCE) * float(np.sqrt((len(full) - 1) * left_out.var()))
     gain = float(np.log(max(full.sum(), 1e-6) / max(half.sum(), 1e-6)))
     return gain / max(float(chance), LEAST_GAIN)
 

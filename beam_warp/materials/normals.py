@@ -14,6 +14,7 @@ from beam_warp.device.arrays import upload
 from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.neighborhoods import (
     launch_consult_neighbors,
+    launch_mean_of_face,
     launch_reach_above,
     launch_thinnest_direction,
 )
@@ -38,6 +39,15 @@ on one of them to self-shadowing (docs/materials.md)."""
 
 ORIENTATION_RAYS = 8
 SMOOTHING_PASSES = 3
+
+FACE_SPREAD = 0.2
+"""Standard deviation of normals that belong to one face [rad]: axes of fitted Gaussians scatter by half of it, and an
+edge of 40 degrees lets next to nothing through."""
+
+FACE_PASSES = 2
+
+LEAST_TOWARDS = 0.3
+"""Cosine to the normal that pixels see from which on a Gaussian's own axis can be that of the surface there."""
 
 
 @dataclass(frozen=True)
@@ -105,36 +115,32 @@ class SurfacePoints:
         """
         device = scene.device
         agreement = evidence.agreement.numpy()
+        rows = np.flatnonzero(evidence.seen)
+        near = _neighbors(evidence.positions.numpy()[rows], device)
+        # What views hardly show of a neighbour is hidden by others: it hides nothing itself.
+        weights = upload((cloud.opacities * np.minimum(evidence.weight, 1.0))[rows].astype(np.float32), float, device)
+        places = upload(evidence.positions.numpy()[rows], wp.vec3, device)
+        faces = _face_normals(cloud, evidence, rows, places, weights, near)
+        normals = evidence.normals.numpy().copy()
+        normals[rows] = faces.numpy()
+        normals = upload(normals, wp.vec3, device)
         if offset != "auto":
-            offsets = ray_offsets(scene, evidence.positions, evidence.normals, offset)
+            offsets = ray_offsets(scene, evidence.positions, normals, offset)
         else:
-            offsets = wp.zeros(len(cloud), dtype=float, device=device)
-            rows = np.flatnonzero(evidence.seen)
-            if len(rows):
-                places = evidence.positions.numpy()[rows]
-                near = cKDTree(places).query(places, k=min(NEIGHBOR_COUNT + 1, len(rows)), workers=-1)[1]
-                # What views hardly show of a neighbour is hidden by others: it hides nothing itself.
-                weights = cloud.opacities[rows] * np.minimum(evidence.weight[rows], 1.0)
-                reach = wp.empty(len(rows), dtype=float, device=device)
-                launch_reach_above(
-                    upload(places, wp.vec3, device),
-                    upload(evidence.normals.numpy()[rows], wp.vec3, device),
-                    (
-                        upload(cloud.positions[rows], wp.vec3, device),
-                        upload(cloud.orientations[rows], wp.quat, device),
-                        upload(cloud.scales[rows], wp.vec3, device),
-                    ),
-                    upload(weights.astype(np.float32), float, device),
-                    upload(near.reshape(len(rows), -1).astype(np.int32), int, device),
-                    reach,
-                    device,
-                )
-                lifts = np.zeros(len(cloud), np.float32)
-                lifts[rows] = LIFT_IN_REACHES * reach.numpy()
-                offsets = upload(lifts, float, device)
+            reach = wp.empty(len(rows), dtype=float, device=device)
+            seen = cloud.select(rows)
+            gaussians = (
+                upload(seen.positions, wp.vec3, device),
+                upload(seen.orientations, wp.quat, device),
+                upload(seen.scales, wp.vec3, device),
+            )
+            launch_reach_above(places, faces, gaussians, weights, near, reach, device)
+            lifts = np.zeros(len(cloud), np.float32)
+            lifts[rows] = LIFT_IN_REACHES * reach.numpy()
+            offsets = upload(lifts, float, device)
         return cls(
             evidence.positions,
-            evidence.normals,
+            normals,
             offsets,
             evidence.seen,
             np.arccos(np.clip(agreement, 0.0, 1.0)).astype(np.float32),
@@ -167,8 +173,7 @@ def estimate_normals(
     if count == 0:
         return SurfaceNormals(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, bool))
     device = scene.device
-    found = cKDTree(cloud.positions).query(cloud.positions, k=min(NEIGHBOR_COUNT + 1, count), workers=-1)[1]
-    neighbors = upload(found.reshape(count, -1).astype(np.int32), int, device)
+    neighbors = _neighbors(cloud.positions, device)
     direction = wp.empty(count, dtype=wp.vec3, device=device)
     planarity = wp.empty(count, dtype=float, device=device)
     launch_thinnest_direction(
@@ -199,6 +204,45 @@ def estimate_normals(
         current, following = following, current
     confidence = np.clip(certainty * np.minimum(2.0 * openness, 1.0) * agreement.numpy(), 0.0, 1.0)
     return SurfaceNormals(current.numpy(), confidence.astype(np.float32), from_shape)
+
+
+def _neighbors(places: NDArray[np.float32], device: wp.Device) -> wp.array:
+    """Return the rows of the nearest places, the own one first, ``(N, K)`` int."""
+    count = len(places)
+    if count == 0:
+        return wp.zeros((0, 1), dtype=int, device=device)
+    found = cKDTree(places).query(places, k=min(NEIGHBOR_COUNT + 1, count), workers=-1)[1]
+    return upload(found.reshape(count, -1).astype(np.int32), int, device)
+
+
+def _face_normals(
+    cloud: GaussianCloud,
+    evidence: ViewEvidence,
+    rows: NDArray[np.intp],
+    places: wp.array,
+    weights: wp.array,
+    near: wp.array,
+) -> wp.array:
+    """Return normals of seen Gaussians that stay crisp at edges, ``(S,)`` vec3.
+
+    What pixels see is a blend of the Gaussians in them, and spread back it is blended once more: edges are rounded
+    by two pixels. A flat Gaussian's own axis is not blended, but it is noisy; so it is averaged over its face. Where
+    pixels agree with the face, to within the noise of the axes, there is no edge, and they know the normal better.
+    """
+    device = near.device
+    own, flatness = _shortest_axes(cloud.select(rows))
+    blended = evidence.normals.numpy()[rows]
+    towards = (own * blended).sum(axis=1)
+    is_own = (flatness > 1.0 - FLAT_RATIO) & (np.abs(towards) > LEAST_TOWARDS)
+    outward = own * np.where(towards < 0.0, -1.0, 1.0)[:, None]
+    current = upload(np.where(is_own[:, None], outward, blended).astype(np.float32), wp.vec3, device)
+    following = wp.empty_like(current)
+    for _ in range(FACE_PASSES):
+        launch_mean_of_face(len(current), places, current, weights, near, FACE_SPREAD, following, device)
+        current, following = following, current
+    faces = current.numpy()
+    agrees = (faces * blended).sum(axis=1) > np.cos(0.5 * FACE_SPREAD)
+    return upload(np.where(agrees[:, None], blended, faces), wp.vec3, device)
 
 
 def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

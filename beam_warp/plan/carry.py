@@ -173,7 +173,8 @@ def _hand_out(job: _Job) -> None:
         following = job.following[worker] = job.schedule.likely_after(step)
         inputs = [(_folder(job, name), job.receipts[name]) for name in step.inputs]
         awaited = tuple(entry for folder, receipt in inputs for entry in awaited_files(folder, receipt))
-        task = Task(step, tuple(receipt.key for _, receipt in inputs), awaited, following)
+        keys, facts = (tuple(getattr(receipt, name) for _, receipt in inputs) for name in ("key", "facts"))
+        task = Task(step, keys, awaited, following, facts)
         job.running[step.name] = _Running(worker, job.workers.now())
         job.workers.start(worker, task)
 

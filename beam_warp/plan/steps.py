@@ -139,12 +139,14 @@ class Task:
         keys: Keys of its inputs, in their order.
         awaited: Path and size [byte] of every file of its inputs, which may become visible late.
         following: Steps that are likely to come next, whose input may be read ahead; none where nobody knows.
+        facts: What the receipts of its inputs say, in their order.
     """
 
     step: Step
     keys: tuple[str, ...] = ()
     awaited: tuple[tuple[str, int], ...] = ()
     following: tuple[Step, ...] = ()
+    facts: tuple[Mapping[str, Any], ...] = ()
 
 
 def perform(works: Mapping[str, Work], task: Task, progress: NotedProgress) -> Receipt:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
 
 from beam_warp.errors import InvalidOptionError
@@ -34,6 +35,7 @@ class FrameBuffers:
         keys: Depths to sort splats by; like ``order.splats``, of twice the length, which sorting needs.
         order: The splats in depth order, and where each one's pairs end.
         pairs: The (tile, splat) pairs of a band.
+        tile_counts: Tiles of long lists, and others, while tiles are put in order.
         frame: Input of compositing, for kernels.
         drawn: Images besides channels, for kernels.
         channel_images: Images of channels, a pass each.
@@ -92,7 +94,10 @@ class FrameBuffers:
             self.pairs.owners = wp.zeros(capacity, dtype=int)
             self.listed_tiles = self.pairs.tiles[:capacity] if capacity else self.pairs.tiles
             lists = TileLists()
-            lists.ranges = wp.zeros(int(self.layout.first_tiles[-1]), dtype=wp.vec2i)
+            tile_count = int(self.layout.first_tiles[-1])
+            lists.ranges = wp.zeros(tile_count, dtype=wp.vec2i)
+            lists.order = wp.array(np.arange(tile_count), dtype=int)
+            self.tile_counts = wp.zeros(2, dtype=int)
             lists.splats = wp.zeros(capacity, dtype=int)
             lists.slots = self.pairs.slots
         self.frame.lists = lists

@@ -14,6 +14,7 @@ from beam_warp.kernels.raster.bin_tiles import (
     launch_emit_pairs,
     launch_find_ranges,
     launch_key_splats,
+    launch_order_tiles,
 )
 from beam_warp.kernels.raster.channel_rows import launch_evaluate_colors, launch_gather_channels
 from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
@@ -51,8 +52,8 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
 
 
 def gather_channels(buffers: FrameBuffers) -> None:
-    """Write every splat's row of channels."""
-    for i, rows in enumerate(buffers.rows):
+    """Write every splat's row of channels; where there are none, rows stay 0."""
+    for i, rows in enumerate(buffers.rows if buffers.channels.count else ()):
         launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.matrix, buffers.device)
 
 
@@ -120,6 +121,10 @@ def list_pairs(buffers: FrameBuffers) -> None:
     launch_emit_pairs(buffers.order, buffers.splats, buffers.views, buffers.gaussian_count, band, pairs, buffers.device)
     wp.utils.radix_sort_pairs(pairs.tiles, pairs.slots, buffers.pair_capacity, end_bit=tile_count.bit_length())
     launch_find_ranges(pairs, tile_count, frame.lists, buffers.device)
+    if buffers.device.is_cuda:
+        buffers.tile_counts.zero_()
+        tiles = frame.lists.ranges[:tile_count], buffers.order.ends
+        launch_order_tiles(tile_count, *tiles, buffers.tile_counts, frame.lists.order[:tile_count], buffers.device)
 
 
 def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) -> None:

@@ -72,8 +72,9 @@ class _Term:
     def _output(self, name: str, value: wp.array | None) -> wp.array | None:
         return None if value is None else require_device_array(name, value, self.shape, self.device)
 
-    def _finish(self, terms: wp.array, scale: float) -> wp.array:
-        launch_sum_floats(terms, scale, self._sums, self._value, self.device)
+    def _finish(self, scale: float, value: bool) -> wp.array:
+        if value:
+            launch_sum_floats(self._terms, scale, self._sums, self._value, self.device)
         return self._value
 
 
@@ -81,7 +82,14 @@ class _ImageTerm(_Term):
     """A mean over the channels of an image and its target, of what two pixels or windows differ by."""
 
     def __call__(
-        self, image: Any, target: Any, *, weight: float = 1.0, mask: Any = None, gradient: wp.array | None = None
+        self,
+        image: Any,
+        target: Any,
+        *,
+        weight: float = 1.0,
+        mask: Any = None,
+        gradient: wp.array | None = None,
+        value: bool = True,
     ) -> wp.array:
         """Return weight * sum over pixels of mask * difference / (H W C), and add its gradient.
 
@@ -92,6 +100,7 @@ class _ImageTerm(_Term):
             mask: Weight of each pixel, or of the window around it, ``(H, W)`` float32, usually in [0, 1]; 1 without. It
                 has no gradient.
             gradient: The derivative with respect to ``image`` is added to it, ``(H, W, C)`` float32.
+            value: Whether the sum is found, which takes three launches; else what is returned is that of before.
 
         Raises:
             InvalidArrayError: An array has another type, shape or device.
@@ -101,7 +110,7 @@ class _ImageTerm(_Term):
         out = self._output("gradient", gradient)
         scale = _scale(weight, self.shape)
         self._compare(picture, truth, self._mask(mask), scale, out)
-        return self._finish(self._terms, scale)
+        return self._finish(scale, value)
 
     def _compare(self, image: wp.array, target: wp.array, mask: Any, scale: float, gradient: Any) -> None:
         """Write the differences to ``_terms``, and add ``scale`` times their gradient."""
@@ -172,6 +181,7 @@ class NormalLoss(_Term):
         tolerance: float = math.inf,
         rendered_gradient: wp.array | None = None,
         expected_gradient: wp.array | None = None,
+        value: bool = True,
     ) -> wp.array:
         """Return weight * sum over pixels of mask * t (sqrt(t^2 + 2 d) - t) / (H W), and add gradients.
 
@@ -188,6 +198,7 @@ class NormalLoss(_Term):
             tolerance: Angle [rad], above 0.
             rendered_gradient: The derivative with respect to ``rendered``, through its normalisation, is added to it.
             expected_gradient: The derivative with respect to ``expected``, taken as it is, is added to it.
+            value: Whether the sum is found, as of images.
 
         Raises:
             InvalidArrayError: An array has another type, shape or device.
@@ -209,7 +220,7 @@ class NormalLoss(_Term):
             self._output("expected_gradient", expected_gradient),
             self.device,
         )
-        return self._finish(self._terms, scale)
+        return self._finish(scale, value)
 
 
 def _scale(weight: float, shape: tuple[int, ...]) -> float:

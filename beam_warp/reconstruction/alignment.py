@@ -5,6 +5,9 @@ times the flow that the number causes at the drawn depth. Differences between ph
 outliers (Huber), are a linear function of the numbers. Each field of pixels gives a score of its own, and their scatter
 gives the covariance of a solution, whatever the errors of neighbouring pixels have in common (White 1980, by clusters).
 
+The gains of the photograph's colours are solved for with the numbers and left out of the result: a camera that is too
+bright seems to have turned to where the subject is brighter.
+
 Errors that a whole view has in common, of a model whose surface shines or is not there yet, do not show in that
 scatter. `MODEL_ERROR` stands for them: it is measured in rigs that are exact.
 """
@@ -44,6 +47,10 @@ MODEL_ERROR = 1.6
 """Standard errors are so many times what the scatter of fields says: of exact rigs, solutions scatter by so much."""
 
 
+ENCODED_KNEE = 0.04045
+"""Where the sRGB curve begins to be a power."""
+
+
 def flow(camera: Camera, depth: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how points move in an image with each number of its camera, ``(11, 2, ...)`` [pixel].
 
@@ -80,8 +87,9 @@ class Evidence:
     """What a photograph says about its camera.
 
     Attributes:
-        informations: Normal matrices of the fields, ``(fields, 11, 11)``.
-        scores: Their right-hand sides, ``(fields, 11)``.
+        informations: Normal matrices of the fields, of the numbers and, after them, of gains that are not asked for,
+            ``(fields, n, n)``.
+        scores: Their right-hand sides, ``(fields, n)``.
     """
 
     informations: NDArray[np.float64]
@@ -92,20 +100,22 @@ class Evidence:
 
         Numbers of other kinds are 0, and are taken for known. So is all of a photograph that shows nothing.
         """
-        chosen = rows_of(kinds)
+        wanted = rows_of(kinds)
         numbers, covariance = np.zeros(NUMBERS), np.zeros((NUMBERS, NUMBERS))
+        others = np.arange(NUMBERS, self.scores.shape[1])
+        chosen = np.concatenate([wanted, others[self.informations[:, others, others].any(axis=0)]])
         fields = self.informations[:, chosen][:, :, chosen]
         information = fields.sum(axis=0)
         size = np.sqrt(np.diag(information))
         surplus = len(self.scores) - len(chosen)
-        if not (len(chosen) and surplus > 0 and size.all()):
+        if not (len(wanted) and surplus > 0 and size.all()):
             return numbers, covariance
         inverse = np.linalg.pinv(information / np.outer(size, size), rcond=1e-9, hermitian=True) / np.outer(size, size)
         solution = inverse @ self.scores[:, chosen].sum(axis=0)
         left = (self.scores[:, chosen] - fields @ solution) @ inverse
-        numbers[chosen] = solution
+        numbers[wanted] = solution[: len(wanted)]
         spread = left.T @ left * (MODEL_ERROR**2 * len(self.scores) / surplus)
-        covariance[np.ix_(chosen, chosen)] = spread
+        covariance[np.ix_(wanted, wanted)] = spread[: len(wanted), : len(wanted)]
         return numbers, covariance
 
 
@@ -121,7 +131,7 @@ def evidence(
     """Return what a photograph says about the camera that a render was drawn for.
 
     Args:
-        drawn: The render's channels, the last one coverage, ``(H, W, C)``.
+        drawn: The render's channels, encoded for display, the last one coverage, ``(H, W, C)``.
         photograph: The same channels of the photograph.
         depth: Of what was drawn, along the optical axis [m], ``(H, W)``.
         camera: The camera, of that size.
@@ -130,6 +140,7 @@ def evidence(
     away = np.asarray(photograph, np.float64) - drawn
     depth = _spread(np.asarray(depth, np.float64), drawn[..., -1] > SEEN)
     lengths = np.sqrt(np.mean(away * away, axis=2))
+    brighter = _brighter(np.asarray(drawn, np.float64))
     limit = OUTLIER * 1.4826 * np.median(lengths[(rows * rows + columns * columns).any(axis=2)] if rows.any() else 0.0)
     weights = np.minimum(1.0, limit / np.maximum(lengths, 1e-12)) if limit > 0.0 else np.ones_like(lengths)
     informations, scores = [], []
@@ -142,10 +153,22 @@ def evidence(
                 continue
             moves = flow(camera, depth[part], places[:, *part])[:, :, ..., None]
             slopes = -(columns[part] * moves[:, 0] + rows[part] * moves[:, 1])
-            flat, weighted = (array.reshape(NUMBERS, -1) for array in (slopes, slopes * weights[part][..., None]))
+            slopes = np.concatenate([slopes, brighter[:, *part]])
+            flat, weighted = (array.reshape(len(slopes), -1) for array in (slopes, slopes * weights[part][..., None]))
             informations.append(weighted @ flat.T)
             scores.append(weighted @ away[part].reshape(-1))
-    return Evidence(np.array(informations).reshape(-1, NUMBERS, NUMBERS), np.array(scores).reshape(-1, NUMBERS))
+    count = NUMBERS + len(brighter)
+    return Evidence(np.array(informations).reshape(-1, count, count), np.array(scores).reshape(-1, count))
+
+
+def _brighter(drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivatives of an encoded image ``(H, W, C)`` to the logarithms of its colours' gains.
+
+    The last channel is coverage, and has no gain: ``(C - 1, H, W, C)``.
+    """
+    count = drawn.shape[-1]
+    slopes = np.where(drawn > ENCODED_KNEE, (drawn + 0.055) / 2.4, drawn)
+    return slopes * np.eye(count)[: count - 1, None, None]
 
 
 def _spread(depth: NDArray[np.float64], is_seen: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -430,7 +430,7 @@ class Fitter:
 
     def _differentiated(self, group: ViewTargets, index: int) -> GaussianGradients:
         """Compare what was drawn with a view, and return the derivatives to the Gaussians."""
-        group.add_losses(index, self._weights)
+        group.add_losses(index, self._weights, values=False)
         return group.rasterizer.backward()
 
     def _stepped(self, view: int) -> None:

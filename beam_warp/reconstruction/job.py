@@ -33,7 +33,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp import converters
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import RigCorrection
 from beam_warp.capture.exposures import RigExposures
@@ -42,6 +41,7 @@ from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.side_file import SideFile
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_path
+from beam_warp.converters.clips import ClipWork
 from beam_warp.converters.staging import require_writable
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidOptionError
@@ -226,7 +226,21 @@ class ReconstructionWork:
                 rank = Rank.KEY_FRAME if previous is None else Rank.TRACKED_FRAME
                 steps.append(Step(frame_step(frame), "frame", frame, inputs, rank))
                 steps.append(Step(f"preview-{frame:06d}", "preview", frame, (frame_step(frame),), Rank.PREVIEW))
-        return Plan(self.folder, tuple(steps), dict.fromkeys((step.stage for step in steps), self))
+        own = Plan(self.folder, tuple(steps), dict.fromkeys((step.stage for step in steps), self))
+        return own.with_steps_of(self.clips.plan())
+
+    @property
+    def may_be_constant(self) -> bool:
+        """Whether there is one segment alone; in it, tracking may still be lost."""
+        return len(self.frames.segments) == 1
+
+    @cached_property
+    def clips(self) -> ClipWork:
+        """Steps that write the asset of several segments; of one alone, the topology is known at the end."""
+        numbers = () if self.may_be_constant else tuple(self.frames.records)
+        return ClipWork(
+            self.folder, Path(ASSET_NAME).stem, self.sequence, [(frame_step(number),) for number in numbers], numbers
+        )
 
     @property
     def device_kind(self) -> str:
@@ -338,7 +352,7 @@ class ReconstructionWork:
             before = track, int(self.store.report(previous)["segment"])
         model = model_frame(self.steps, step.frame, views, before, progress)
         self.store.write(step.frame, model)
-        return {"line": frame_line(model.report)}
+        return {"line": frame_line(model.report), "report": model.report}
 
     def _preview(self, frame: int) -> NDArray[np.uint8]:
         """Draw the preview of a stored frame; its images are read again where they are not at hand."""
@@ -356,13 +370,13 @@ class ReconstructionWork:
         )
 
     def sequence(self, *, is_constant: bool | None = None) -> GaussianSequence:
-        """Return the stored frames; see `stored_sequence`."""
+        """Return the stored frames; see `stored_sequence`. Several segments have no identities in common."""
         frames = tuple(self.frames.records)
         return stored_sequence(
             [self.store.path(frame) for frame in frames],
             self.capture.frames_per_second or 30.0,
             {**(self.steps.raster or RasterOptions()).as_metadata(), **capture_frames_metadata(frames)},
-            is_constant,
+            is_constant if self.may_be_constant else False,
         )
 
     def seen(self) -> Capture:
@@ -373,7 +387,7 @@ class ReconstructionWork:
         """Write asset and report of a plan that was carried out, begun at a time [s]."""
         progress("write asset", 0, 1)
         sequence = self.sequence()
-        converters.write(sequence, self.folder / ASSET_NAME)
+        self.clips.write(sequence, self.folder / ASSET_NAME, receipts)
         progress("write asset", 1, 1)
         report = {**self._report(receipts), "seconds": time.perf_counter() - started}
         write_report(self.folder, report)
@@ -393,7 +407,7 @@ class ReconstructionWork:
         """Return what was done and found, JSON-able."""
         records = self.records
         made = {frame: receipts[frame_step(frame)] for frame in records}
-        frames = [{**self.store.report(frame), "seconds": receipt.seconds} for frame, receipt in made.items()]
+        frames = [{**receipt.facts["report"], "seconds": receipt.seconds} for receipt in made.values()]
         findings = self._findings()
         return {
             "input": {

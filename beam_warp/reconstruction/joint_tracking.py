@@ -183,7 +183,7 @@ class JointTracker:
         self._carry()
         group.select(index)
         group.rasterizer.redraw()
-        group.add_losses(index, self._options.weights)
+        group.add_losses(index, self._options.weights, values=False)
         drawn = group.rasterizer.backward()
         self._rotation_gradients.zero_()
         self._position_gradients.zero_()
@@ -203,5 +203,6 @@ class JointTracker:
             weight=rigidity,
             rotation_gradients=self._rotation_gradients,
             position_gradients=self._position_gradients,
+            value=False,
         )
         adam.step()

@@ -31,10 +31,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtri
 
 from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.capture.views import CapturedView
@@ -89,8 +89,9 @@ LEAST_CHANCE, LEAST_VARIANCE = 0.01, 1e-4
 LEAST_SPREAD = 0.01
 """Least standard deviation of a colour that is assumed, of itself: that of eight bits and of filters."""
 
-FIT_GAUSSIANS = 10_000
-"""Most Gaussians of the surface at which views are compared."""
+FIT_GAUSSIANS, FIT_STEPS = 20_000, 900
+"""Most Gaussians of the surface at which views are compared, and steps of their fit: where highlights are depends on
+normals. With those of a finished fit, exposures of walker and runner are found to 1 %, of 450 steps to 2."""
 
 LARGEST_SIDE = 320
 """Pixels of a side at which views are compared, about."""
@@ -163,7 +164,15 @@ def _surface(
     """Return Gaussians that a quick fit brings to the surface, and their normals, 0 where these are not known."""
     count = min(options.gaussian_count, FIT_GAUSSIANS)
     start = initial_gaussians(views, count, device=device, seed=options.seed)
-    fitting = FitOptions.of_preset("draft", gaussian_count=count, raster=options.raster, samples=1, seed=options.seed)
+    fitting = FitOptions.of_preset(
+        "draft",
+        gaussian_count=count,
+        color_iterations=FIT_STEPS // 3,
+        normal_iterations=FIT_STEPS - FIT_STEPS // 3,
+        raster=options.raster,
+        samples=1,
+        seed=options.seed,
+    )
     cloud = fit_gaussians(views, start, fitting, device=device, progress=progress).cloud
     outward = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])
     nearest = cKDTree(start.positions).query(cloud.positions, workers=-1)[1]
@@ -325,6 +334,6 @@ def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
 def _part_beyond_chance(found: NDArray[np.float64], error: float, freedom: int) -> float:
     """Return the part of what was found that an error does not explain: 0 unless an F test says that it is not all."""
     signal = float(np.mean(np.square(found)))
-    if not signal > error**2 * stats.f.isf(CHANCE, freedom, freedom):
+    if not signal > error**2 / fdtri(freedom, freedom, CHANCE):  # F's upper quantile, of equal freedoms
         return 0.0
     return 1.0 - error**2 / signal

@@ -22,6 +22,7 @@ from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
     launch_add_sample_gradients,
     launch_average,
+    launch_believe,
     launch_square_error,
 )
 from beam_warp.raster.depth_normals import DepthNormals
@@ -147,6 +148,7 @@ class ViewTargets:
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
+        self._doubts = [None if view.doubt is None else upload(view.doubt, float, self.device) for view in views]
         self._subjects = [
             self.height * self.width if view.alpha is None else int((view.alpha > 0.5).sum()) for view in views
         ]
@@ -192,25 +194,36 @@ class ViewTargets:
         self._cameras[index] = PreparedCameras(moved.cameras, moved.layout, self._cameras[index].views)
         self.cameras = (*self.cameras[:index], fine, *self.cameras[index + 1 :])
 
-    def add_losses(self, index: int, weights: LossWeights) -> list[wp.array]:
+    def add_losses(self, index: int, weights: LossWeights, *, values: bool = True) -> list[wp.array]:
         """Compare what was drawn last with a view, and write the derivatives to the rasteriser's adjoints.
 
+        What is not known of a pixel is taken to be what was drawn.
+
         Returns:
-            The terms that count, one element each: colour, structure, coverage, normals.
+            The terms that count, one element each: colour, structure, coverage, normals. Without ``values`` they are
+            not brought up to date, which saves a dozen launches.
         """
         self._adjoints.zero_()
         self._to_encoded.zero_()
         launch_average(self._color, self.samples, True, self._encoded, self.device)
-        target = self._colors[index]
-        terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded)]
+        target, doubt = self._colors[index], self._doubts[index]
+        launch_believe(doubt, target, self._encoded, self.device)
+        terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded, value=values)]
         if weights.ssim > 0.0:
-            terms.append(self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded))
+            terms.append(
+                self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded, value=values)
+            )
+        launch_believe(doubt, None, self._to_encoded, self.device)
         launch_add_sample_gradients(self._color, self.samples, True, self._to_encoded, self._to_color, self.device)
         alpha = self._alphas[index]
         if alpha is not None and weights.alpha > 0.0:
             self._to_covered.zero_()
             launch_average(self._alpha, self.samples, False, self._covered, self.device)
-            terms.append(self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered))
+            launch_believe(doubt, alpha, self._covered, self.device)
+            terms.append(
+                self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered, value=values)
+            )
+            launch_believe(doubt, None, self._to_covered, self.device)
             launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
         if weights.normal > 0.0:
             self._to_surface.zero_()
@@ -225,6 +238,7 @@ class ViewTargets:
                     tolerance=weights.normal_tolerance or math.inf,
                     rendered_gradient=self._to_normal,
                     expected_gradient=self._to_surface,
+                    value=values,
                 )
             )
             geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
@@ -267,14 +281,18 @@ class ViewTargets:
     def compared(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return what was drawn last and a view with coverage, encoded, ``(H, W, 4)`` each, and depth ``(H, W)`` [m].
 
-        Pixels are drawn by one sample, so that each has a depth.
+        Pixels are drawn by one sample, so that each has a depth. What is not known of the view is as it was drawn.
         """
         alpha = self._alphas[index]
         assert alpha is not None
         assert self.samples == 1
         launch_average(self._color, self.samples, True, self._encoded, self.device)
         drawn = np.dstack([self._encoded.numpy(), self._alpha.numpy()])
-        return drawn, np.dstack([self._colors[index].numpy(), alpha.numpy()]), self._depth.numpy()
+        photograph = np.dstack([self._colors[index].numpy(), alpha.numpy()])
+        doubt = self._doubts[index]
+        if doubt is not None:
+            photograph += doubt.numpy()[..., None] * (drawn - photograph)
+        return drawn, photograph, self._depth.numpy()
 
     def gap(self, index: int) -> float:
         """Return the largest connected part of a view's subject that what was drawn last does not cover, a fraction.

@@ -16,7 +16,9 @@ from beam_warp.device.arrays import members, upload, zero_struct
 from beam_warp.device.morton import morton_order
 from beam_warp.kernels.light.lights import Lights
 from beam_warp.kernels.render.cluster_bounces import (
+    PARTS,
     Clusters,
+    ClusterSums,
     launch_bounce_clusters,
     launch_gather_bounces,
     launch_sum_clusters,
@@ -59,11 +61,12 @@ class ArrivingLight:
             self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
             self._clusters = zero_struct(Clusters, cluster_count, device)
             self._clusters.order = wp.zeros(gaussian_count, dtype=int)
-            self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec3) for _ in range(2)]
+            self._cluster_sums = zero_struct(ClusterSums, PARTS * cluster_count, device)
+            self._radiosity = [wp.zeros(cluster_count, dtype=wp.vec4) for _ in range(2)]
             self._distant = DistantLight()
             self._distant.turn = wp.zeros(1, dtype=wp.vec2)
             self._moments = LightMoments()
-            self._no_radiosity = wp.zeros(0, dtype=wp.vec3)
+            self._no_radiosity = wp.zeros(0, dtype=wp.vec4)
         self._no_maps = ShadowMaps()
         self._regions = RegionShadows()
         self._lights = Lights()
@@ -77,8 +80,8 @@ class ArrivingLight:
         self._stale = {"regions": True, "lights": True}
 
     def order(self, positions: wp.array) -> None:
-        """Cluster Gaussians that are near each other; to be called once for every cloud."""
-        if self._count and self._options.bounces:
+        """Put Gaussians that are near each other side by side; to be called once for every cloud."""
+        if self._count and self._options.lights_gaussians:
             everybody = wp.full(self._count, 1, dtype=int, device=self._device)
             items, _ = morton_order(positions, positions, everybody)
             wp.copy(self._clusters.order, items, count=self._count)
@@ -199,7 +202,9 @@ class ArrivingLight:
         """Find the irradiance that reaches the Gaussians."""
         if not self._options.lights_gaussians or not self._count:
             return
-        launch_light_gaussians(gaussians, self.scene_light(), self._arriving, self._lit, self._device)
+        launch_light_gaussians(
+            self._clusters.order, gaussians, self.scene_light(), self._arriving, self._lit, self._device
+        )
         radiosity = self._bounced(gaussians) if self._options.bounces else self._no_radiosity
         launch_gather_bounces(
             len(gaussians.positions),
@@ -213,10 +218,11 @@ class ArrivingLight:
 
     def _bounced(self, gaussians: GaussianArrays) -> wp.array:
         """Return the radiosity of the clusters after all bounces but the last."""
-        launch_sum_clusters(gaussians, self._lit, self._distant.light.albedo_terms, self._clusters, self._device)
-        radiosity = self._clusters.sent
+        clusters, sums = self._clusters, self._cluster_sums
+        launch_sum_clusters(gaussians, self._lit, self._distant.light.albedo_terms, sums, clusters, self._device)
+        radiosity = clusters.sent
         for bounce in range(self._options.bounces - 1):
             following = self._radiosity[bounce % 2]
-            launch_bounce_clusters(len(following), self._clusters, radiosity, following, self._device)
+            launch_bounce_clusters(clusters, radiosity, sums, following, self._device)
             radiosity = following
         return radiosity

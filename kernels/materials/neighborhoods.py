@@ -102,6 +102,36 @@ def consult_neighbors_kernel(
 
 
 @wp.kernel
+def mean_of_face_kernel(
+    first: int,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    weights: wp.array[float],
+    neighbors: wp.array2d[int],
+    spread: float,
+    out_normals: wp.array[wp.vec3],
+):
+    """Mean of the normals around a point, of those that differ from its own by little (Tomasi and Manduchi 1998).
+
+    Weights fall with distance, by half of the farthest neighbour's, and with the difference of the normals, by
+    ``spread`` [rad]: what lies beyond an edge does not count.
+    """
+    i = first + wp.tid()
+    count = neighbors.shape[1]
+    own = normals[i]
+    reach = wp.max(wp.length(points[neighbors[i, count - 1]] - points[i]), 1.0e-12)
+    total = wp.vec3()
+    for k in range(count):
+        j = neighbors[i, k]
+        distance = wp.length(points[j] - points[i]) / reach
+        difference = wp.length(normals[j] - own) / spread
+        total += normals[j] * (weights[j] * wp.exp(-2.0 * distance * distance - 0.5 * difference * difference))
+    if wp.length(total) > 1.0e-12:
+        own = wp.normalize(total)
+    out_normals[i] = own
+
+
+@wp.kernel
 def reach_above_kernel(
     first: int,
     points: wp.array[wp.vec3],
@@ -141,6 +171,10 @@ launch_thinnest_direction = launcher(thinnest_direction_kernel)
 
 launch_consult_neighbors = launcher(consult_neighbors_kernel)
 """Do one pass of smoothing."""
+
+
+launch_mean_of_face = launcher(mean_of_face_kernel)
+"""Do one pass of smoothing that edges stop."""
 
 
 def launch_reach_above(points, normals, gaussians, weights, neighbors, out_reach, device):

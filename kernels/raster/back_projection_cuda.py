@@ -46,7 +46,7 @@ def back_project_cuda_kernel(channel_count: int):
         thread = item % THREADS
         lane = item % LANES
         part = thread / LANES
-        listed = item / THREADS
+        listed = frame.lists.order[item / THREADS]
         listed_range = frame.lists.ranges[listed]
         if listed_range[0] == listed_range[1]:  # all threads of the block alike
             return

@@ -122,7 +122,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         thread = item % THREADS
         lane = item % LANES
         part = thread / LANES
-        listed = item / THREADS
+        listed = frame.lists.order[item / THREADS]
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
         listed_range = frame.lists.ranges[listed]

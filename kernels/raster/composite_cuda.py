@@ -18,17 +18,18 @@ from beam_warp.kernels.common.lanes import (
 )
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
-from beam_warp.kernels.raster.bin_tiles import SIDE
+from beam_warp.kernels.raster.bin_tiles import SIDE, TileLists
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
+    EXTENT_MARGIN,
     MEDIAN,
+    RELATIVE_MARGIN,
     alpha_of,
     depth_function,
     log_alpha_of,
     offset_from,
-    reach_columns,
-    reach_rows,
+    quick_divide,
     squared_extent,
     whiten,
 )
@@ -46,18 +47,38 @@ CENTER, SHAPE, SLOPE, BEND = (wp.constant(k) for k in range(4))
 
 @wp.func
 def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, width: int, height: int) -> int:
-    """1 if a splat reaches a box of pixels, ``first`` being the centre of its first one."""
-    squared = squared_extent(center[2])
-    y0 = first[1] - center[1]
-    y1 = y0 + float(height - 1)
-    rows = reach_rows(shape, squared)
-    if y0 > rows or y1 < -rows:
-        return 0
-    columns = reach_columns(shape, squared, y0, y1)
+    """1 if a splat reaches a box of pixels, ``first`` being the centre of its first one.
+
+    Where the box, a little enlarged, does not hold the splat's centre, its least squared distance in standard
+    deviations is on one of the two sides that face the centre. No root and no exact quotient is needed.
+    """
     x0 = first[0] - center[0]
-    if x0 > columns[1] or x0 + float(width - 1) < columns[0]:
-        return 0
-    return 1
+    y0 = first[1] - center[1]
+    x1 = x0 + float(width - 1)
+    y1 = y0 + float(height - 1)
+    farthest = wp.max(wp.max(-x0, x1), wp.max(-y0, y1))
+    margin = RELATIVE_MARGIN * farthest + EXTENT_MARGIN
+    x0 -= margin
+    y0 -= margin
+    x1 += margin
+    y1 += margin
+    x = wp.clamp(0.0, x0, x1)
+    y = wp.clamp(0.0, y0, y1)
+    across = whiten(shape, wp.vec2(x, wp.clamp(shape[1] * x, y0, y1)))
+    e = shape[1] * shape[2]
+    nearest = quick_divide(e * shape[2] * y, shape[0] * shape[0] + e * e)
+    down = whiten(shape, wp.vec2(wp.clamp(nearest, x0, x1), y))
+    least = wp.min(wp.dot(across, across), wp.dot(down, down))
+    return wp.where(least <= squared_extent(center[2]), 1, 0)
+
+
+@wp.func
+def listed_splat(lists: TileLists, place: int, end: int) -> int:
+    """The splat at a place of the lists; any where they end."""
+    splat = int(0)
+    if place < end:
+        splat = lists.splats[place]
+    return splat
 
 
 @cache
@@ -78,7 +99,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
     ):
         item = first + wp.tid()
         lane = item % LANES
-        listed = item / (SIDE * SIDE)
+        listed = frame.lists.order[item / (SIDE * SIDE)]
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
         part = (item % (SIDE * SIDE)) / LANES
@@ -97,13 +118,17 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
         listed_range = frame.lists.ranges[listed]
         last = int(-1)
         begin = listed_range[0]
+        # What the lanes look at next is loaded while they composite: a list is as slow as its loads otherwise.
+        splat = listed_splat(frame.lists, begin + lane, listed_range[1])
+        following = listed_splat(frame.lists, begin + LANES + lane, listed_range[1])
+        center = wp.vec4()
+        shape = wp.vec4()
+        if begin < listed_range[1]:
+            center = load_row(frame.splats.centers, splat)
+            shape = load_row(frame.splats.shapes, splat)
         while begin < listed_range[1]:
-            mine = begin + lane
             wanted = int(0)
-            if mine < listed_range[1]:
-                splat = frame.lists.splats[mine]
-                center = load_row(frame.splats.centers, splat)
-                shape = load_row(frame.splats.shapes, splat)
+            if begin + lane < listed_range[1]:
                 wanted = reaches(center, shape, box.position, WIDTH, HEIGHT)
                 if wanted != 0:
                     share_row(1, CENTER, lane, center)
@@ -113,6 +138,10 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
                         share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
                     share_channels(1, lane, channels, splat)
             waiting = ballot(wanted)
+            splat = following
+            center = load_row(frame.splats.centers, splat)
+            shape = load_row(frame.splats.shapes, splat)
+            following = listed_splat(frame.lists, begin + 2 * LANES + lane, listed_range[1])
             wait_for_lanes()
             while waiting != 0:
                 bit = lowest_lane(waiting)

@@ -65,6 +65,18 @@ def add_sample_gradients_kernel(
 
 
 @wp.kernel
+def believe_kernel(first: int, doubt: wp.array2d[float], known: wp.array3d[float], out_values: wp.array3d[float]):
+    item = first + wp.tid()
+    y = item / out_values.shape[1]
+    x = item % out_values.shape[1]
+    for channel in range(out_values.shape[2]):
+        other = float(0.0)
+        if known:
+            other = known[y, x, channel]
+        out_values[y, x, channel] += doubt[y, x] * (other - out_values[y, x, channel])
+
+
+@wp.kernel
 def square_error_kernel(first: int, encoded: wp.array3d[float], target: wp.array3d[float], out_errors: wp.array[float]):
     item = first + wp.tid()
     y = item / target.shape[1]
@@ -89,6 +101,12 @@ def launch_add_sample_gradients(
     pixels = gradients.shape[0] * gradients.shape[1]
     inputs = [samples, factor, is_color, gradients]
     launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients], device=device)
+
+
+def launch_believe(doubt: Any, known: Any, out_values: Any, device: Any) -> None:
+    """Make values ``(H, W, C)`` as much like those of a target, 0 without, as a pixel is in doubt; stay without doubt."""
+    if doubt is not None:
+        launch(believe_kernel, doubt.size, inputs=[doubt, known], outputs=[out_values], device=device)
 
 
 launch_square_error = launcher(square_error_kernel)

@@ -87,14 +87,18 @@ def row_vector(values: wp.array2d[float], row: int, column: int) -> wp.vec3:
 @wp.kernel
 def light_gaussians_kernel(
     first: int,
+    order: wp.array[int],
     positions: wp.array[wp.vec3],
     values: wp.array2d[float],
     light: SceneLight,
     out_arriving: wp.array[wp.vec4],
     out_lit: wp.array[wp.vec3],
 ):
-    """``out_arriving`` is the environment's, and its share of the unshadowed luminance; ``out_lit`` all lights'."""
-    i = first + wp.tid()
+    """``out_arriving`` is the environment's, and its share of the unshadowed luminance; ``out_lit`` all lights'.
+
+    Neighbours in ``order`` are near each other in space: they read the same texels.
+    """
+    i = order[first + wp.tid()]
     normal = row_vector(values, i, NORMAL)
     point = positions[i]
     turn = random_turn(i)
@@ -109,12 +113,12 @@ def light_gaussians_kernel(
     out_lit[i] = arriving + lit_irradiance(light.lights, light.shadows, point, normal, turn)
 
 
-def launch_light_gaussians(gaussians, light, out_arriving, out_lit, device):
-    """Find what arrives at the Gaussians, of their positions and values."""
+def launch_light_gaussians(order, gaussians, light, out_arriving, out_lit, device):
+    """Find what arrives at the Gaussians, of their positions and values, in an order."""
     launch(
         light_gaussians_kernel,
         len(gaussians.positions),
-        inputs=[gaussians.positions, gaussians.values, light],
+        inputs=[order, gaussians.positions, gaussians.values, light],
         outputs=[out_arriving, out_lit],
         device=device,
         block_dim=128,

@@ -31,6 +31,7 @@ from beam_warp.kernels.light.scattering import (
     shading_of,
 )
 from beam_warp.kernels.render.path_vertices import PathMaterials, Vertex, first_vertex, lifted_vertex, next_vertex
+from beam_warp.kernels.trace.closest_surface import HIT_THREADS
 from beam_warp.kernels.trace.occluders import transmittance
 from beam_warp.kernels.trace.settings import TraceSettings
 
@@ -322,5 +323,5 @@ def trace_paths_kernel(
     out_images.caught[pixel] = out_images.caught[pixel] + caught
 
 
-launch_trace_paths = launcher(trace_paths_kernel, block_dim=64, min_chunk=PIXEL_CHUNK)
+launch_trace_paths = launcher(trace_paths_kernel, block_dim=HIT_THREADS, min_chunk=PIXEL_CHUNK)
 """Add a pass of samples to each of ``pixels``, numbers that must differ from each other."""

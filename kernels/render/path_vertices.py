@@ -15,7 +15,7 @@ from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.occluder import nearest_on_mesh
 from beam_warp.kernels.mesh.surface import RAY_LIFT, MeshSurface, surface_point
-from beam_warp.kernels.trace.closest_surface import BUFFER_SIZE, LAST, nearest_hits
+from beam_warp.kernels.trace.closest_surface import BUFFER_SIZE, LAST, hit_index, hit_time, nearest_hits
 from beam_warp.kernels.trace.gaussian import ray_peak
 from beam_warp.kernels.trace.occluders import surface_layer
 from beam_warp.kernels.trace.settings import TraceSettings
@@ -165,40 +165,41 @@ def first_vertex(
         more = 0
         if buffer.count >= BUFFER_SIZE:  # a full buffer may have hidden others from view
             more = 1
-        for k in range(BUFFER_SIZE):
-            if k < taken and transmittance >= settings.stop:
-                index = buffer.index[k]
-                t = buffer.t[k]
-                peak = ray_peak(occluders.gaussians, index, origin, direction)
-                size = materials.sizes[index]
-                if layer.weight > 0.0 and t - layer.last > GAP_IN_SIZES * wp.min(size, layer.last_size):
-                    if chosen == 1:
-                        transmittance = 0.0
-                    else:
-                        if wp.dot(layer.normal, direction) < 0.0:
-                            facing = layer
-                        layer = Layer()
-                if peak.alpha > 0.0 and transmittance > 0.0:
-                    weight = transmittance * peak.alpha
-                    shape = load_row(materials.normal_thickness, index)
-                    if layer.weight == 0.0:
-                        layer.start = t
-                    behind = t - layer.start
-                    layer.weight += weight
-                    layer.t += weight * behind
-                    layer.t_squared += weight * behind * behind
-                    layer.thickness_squared += weight * shape[3] * shape[3]
-                    layer.normal += weight * wp.vec3(shape[0], shape[1], shape[2])
-                    layer.color_roughness += weight * load_row(materials.color_roughness, index)
-                    layer.last = t
-                    layer.last_size = size
-                    transmittance *= 1.0 - peak.alpha
-                    if 1.0 - transmittance > choice:
-                        chosen = 1
+        k = int(0)
+        while k < taken and transmittance >= settings.stop:
+            index = hit_index(buffer, k)
+            t = hit_time(buffer, k)
+            peak = ray_peak(occluders.gaussians, index, origin, direction)
+            size = materials.sizes[index]
+            if layer.weight > 0.0 and t - layer.last > GAP_IN_SIZES * wp.min(size, layer.last_size):
+                if chosen == 1:
+                    transmittance = 0.0
+                else:
+                    if wp.dot(layer.normal, direction) < 0.0:
+                        facing = layer
+                    layer = Layer()
+            if peak.alpha > 0.0 and transmittance > 0.0:
+                weight = transmittance * peak.alpha
+                shape = load_row(materials.normal_thickness, index)
+                if layer.weight == 0.0:
+                    layer.start = t
+                behind = t - layer.start
+                layer.weight += weight
+                layer.t += weight * behind
+                layer.t_squared += weight * behind * behind
+                layer.thickness_squared += weight * shape[3] * shape[3]
+                layer.normal += weight * wp.vec3(shape[0], shape[1], shape[2])
+                layer.color_roughness += weight * load_row(materials.color_roughness, index)
+                layer.last = t
+                layer.last_size = size
+                transmittance *= 1.0 - peak.alpha
+                if 1.0 - transmittance > choice:
+                    chosen = 1
+            k += 1
         if transmittance < settings.stop:
             more = 0
-        t_last = buffer.t[LAST]
-        index_last = buffer.index[LAST]
+        t_last = hit_time(buffer, LAST)
+        index_last = hit_index(buffer, LAST)
     vertex = Vertex()
     if chosen == 1:
         # The inside of a surface is seen through leaks of its outside, which is what was meant to be seen.

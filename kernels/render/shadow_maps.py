@@ -19,6 +19,7 @@ from beam_warp.kernels.mesh.surface import MeshSurface
 from beam_warp.kernels.raster.depth_normals import LEAST_DEPTH
 from beam_warp.kernels.raster.pinholes import camera_point, image_point, room_around
 from beam_warp.kernels.raster.project import RasterView
+from beam_warp.kernels.raster.splat_rows import quick_divide
 
 wp.set_module_options({"enable_backward": False})
 
@@ -130,7 +131,7 @@ def receive(maps: ShadowMaps, k: int, point: wp.vec3, normal: wp.vec3) -> Receiv
 @wp.func
 def rise(distance: float, width: float) -> float:
     """0 before, 1 from the width on."""
-    return wp.clamp(distance / wp.max(width, 1.0e-9), 0.0, 1.0)
+    return wp.clamp(quick_divide(distance, wp.max(width, 1.0e-9)), 0.0, 1.0)
 
 
 @wp.func
@@ -146,7 +147,7 @@ def hidden_share(texel: wp.vec4, depth: float, bias: float, thickness: float) ->
             layer = wp.max(mean, median)
         by_gaussians = texel[0] * rise(depth - layer - soft, soft)
         if mean > median + thickness and depth > median:
-            share = wp.clamp((depth - mean) / (depth - median), 0.5, 1.0)
+            share = wp.clamp(quick_divide(depth - mean, depth - median), 0.5, 1.0)
             by_gaussians = by_gaussians * share
     by_mesh = rise(depth - texel[3] - bias, bias)
     return 1.0 - (1.0 - by_gaussians) * (1.0 - by_mesh)

@@ -103,7 +103,7 @@ def pack_gaussians_kernel(
     out_bounds.takes_part[i] = wp.where(fate == TRACED or fate == RAISED, 1, 0)
 
 
-FATES_A_THREAD = wp.constant(256)
+FATES_A_THREAD = wp.constant(32)
 
 
 @wp.kernel

@@ -9,7 +9,6 @@ from typing import Any
 
 import warp as wp
 
-from beam_warp.kernels.common.constants import LARGEST_FLOAT
 from beam_warp.kernels.common.launching import launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.mesh.occluder import nearest_on_mesh
@@ -20,19 +19,106 @@ from beam_warp.kernels.trace.wide_tree import WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
 
-BUFFER_SIZE = 16
-Times = wp.types.vector(length=BUFFER_SIZE, dtype=wp.float32)
-Indices = wp.types.vector(length=BUFFER_SIZE, dtype=wp.int32)
+BUFFER_SIZE = 32
+"""Hits of a round: a surface of overlapping Gaussians stops a ray after about so many."""
+
+HIT_THREADS = 64
+"""Threads of a block of the kernels that keep hits: each has a column of shared memory."""
+
+Hits = wp.types.vector(length=BUFFER_SIZE, dtype=wp.uint64)
 LAST = wp.constant(BUFFER_SIZE - 1)
 
 
 @wp.struct
 class HitBuffer:
-    """The nearest hits of a round in order; free places hold infinity."""
+    """The nearest hits of a round in order: the bits of t before the Gaussian's number, which sort like both."""
 
-    t: Times
-    index: Indices
+    hits: Hits  # on the CPU; a kernel on CUDA keeps them in shared memory, of the buffer that it began last
     count: int  # hits met, those that found no place included
+
+
+_HITS = """
+#if defined(__CUDA_ARCH__)
+    __shared__ wp::uint64 kept[SIZE * THREADS];
+    wp::uint64* own = kept + threadIdx.x;
+    const int stride = THREADS;
+#else
+    wp::uint64* own = &buffer.hits[0];
+    const int stride = 1;
+#endif
+    if (!insert)
+        return own[place * stride];
+    if (buffer.count++ >= SIZE && hit >= own[(SIZE - 1) * stride])
+        return hit;
+    int to = wp::min(buffer.count, SIZE) - 1;
+    for (; to > 0 && hit < own[(to - 1) * stride]; --to)
+        own[to * stride] = own[(to - 1) * stride];
+    own[to * stride] = hit;
+    return hit;
+"""
+
+
+@wp.func_native(_HITS.replace("SIZE", str(BUFFER_SIZE)).replace("THREADS", str(HIT_THREADS)))
+def hits_of_thread(buffer: wp.ref[HitBuffer], insert: bool, hit: wp.uint64, place: int) -> wp.uint64:
+    """Sink a hit to its place in the buffer, where the last one falls out if it is full; or return the one at a place.
+
+    A thread's own array lies in CUDA's local memory, where threads that look at different places wait for each other.
+    In shared memory a place of every thread has a bank of its own.
+    """
+    ...
+
+
+@wp.func_native("""
+    union { float value; wp::uint32 bits; } time;
+    time.value = t;
+    return static_cast<wp::uint64>(time.bits) << 32 | static_cast<wp::uint32>(index);
+""")
+def packed_hit(t: float, index: int) -> wp.uint64:
+    """The number that a hit of positive ``t`` is sorted by."""
+    ...
+
+
+@wp.func_native("""
+    union { wp::uint32 bits; float value; } time;
+    time.bits = static_cast<wp::uint32>(hit >> 32);
+    return time.value;
+""")
+def time_of(hit: wp.uint64) -> float: ...
+
+
+@wp.func
+def insert_hit(buffer: wp.ref[HitBuffer], t: float, index: int):
+    hits_of_thread(buffer, True, packed_hit(t, index), 0)
+
+
+@wp.func
+def hit_time(buffer: wp.ref[HitBuffer], place: int) -> float:
+    """``t`` of a hit."""
+    return time_of(hits_of_thread(buffer, False, wp.uint64(0), place))
+
+
+@wp.func
+def hit_index(buffer: wp.ref[HitBuffer], place: int) -> int:
+    """Number of a hit's Gaussian."""
+    return int(hits_of_thread(buffer, False, wp.uint64(0), place) & wp.uint64(0xFFFFFFFF))
+
+
+@wp.func
+def insert_leaf(
+    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: wp.ref[HitBuffer], leaf: int
+):
+    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
+    if peak.alpha > 0.0 and is_before(ray.t_min, ray.index_min, peak.t, peak.index):
+        insert_hit(found, peak.t, peak.index)
+
+
+@wp.func
+def reach_of_buffer(ray: TracedRay, found: wp.ref[HitBuffer]) -> float:
+    """What lies behind a full buffer is passed over."""
+    reach = ray.t_max
+    if found.count >= BUFFER_SIZE:
+        reach = wp.min(reach, hit_time(found, LAST))
+    return reach
 
 
 @wp.func
@@ -40,51 +126,7 @@ def is_before(t: float, index: int, other_t: float, other_index: int) -> bool:
     return t < other_t or (t == other_t and index < other_index)
 
 
-@wp.func
-def insert_hit(buffer: HitBuffer, t: float, index: int) -> HitBuffer:
-    """Sink a hit to its place; the last one falls out. Unrolled, so that the buffer stays in registers."""
-    result = buffer
-    moving_t = t
-    moving_index = index
-    for k in range(BUFFER_SIZE):
-        if is_before(moving_t, moving_index, result.t[k], result.index[k]):
-            other_t = result.t[k]
-            other_index = result.index[k]
-            result.t[k] = moving_t
-            result.index[k] = moving_index
-            moving_t = other_t
-            moving_index = other_index
-    result.count += 1
-    return result
-
-
-@wp.func
-def empty_buffer() -> HitBuffer:
-    buffer = HitBuffer()
-    for k in range(BUFFER_SIZE):
-        buffer.t[k] = LARGEST_FLOAT
-        buffer.index[k] = 0x7FFFFFFF
-    return buffer
-
-
-@wp.func
-def insert_leaf(
-    tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, found: HitBuffer, leaf: int
-) -> HitBuffer:
-    peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
-    buffer = found
-    if peak.alpha > 0.0 and is_before(ray.t_min, ray.index_min, peak.t, peak.index):
-        buffer = insert_hit(found, peak.t, peak.index)
-    return buffer
-
-
-@wp.func
-def reach_of_buffer(ray: TracedRay, found: HitBuffer) -> float:
-    """What lies behind a full buffer is passed over."""
-    return wp.min(ray.t_max, found.t[LAST])
-
-
-insert_all = traversal("insert_all", insert_leaf, reach=reach_of_buffer, ordered=True)
+insert_all = traversal("insert_all", insert_leaf, reach=reach_of_buffer, ordered=True, in_place=True)
 
 
 @wp.func
@@ -102,7 +144,7 @@ def nearest_hits(
     ray = traced_ray(origin, direction, t_max)
     ray.t_min = t_last
     ray.index_min = index_last
-    return insert_all(tree, gaussians, settings, ray, empty_buffer())
+    return insert_all(tree, gaussians, settings, ray, HitBuffer())
 
 
 @wp.func
@@ -177,24 +219,26 @@ def trace_surface_kernel(
             occluders.tree, occluders.gaussians, settings, origin, direction, t_last, index_last, mesh.t
         )
         taken = wp.min(buffer.count, BUFFER_SIZE)
-        for k in range(BUFFER_SIZE):
-            if k < taken and transmittance >= settings.stop:
-                index = buffer.index[k]
-                peak = ray_peak(occluders.gaussians, index, origin, direction)
-                if peak.alpha > 0.0:  # at the support's edge leaf and packed rows may round to different sides
-                    weight = transmittance * peak.alpha
-                    opacity += weight
-                    depth += weight * buffer.t[k]
-                    normal += entry_normal(occluders.gaussians, index, origin, direction) * weight
-                    for channel in range(channels):
-                        out_records.attributes[i, channel] += weight * attributes[index, channel]
-                    transmittance *= 1.0 - peak.alpha
-                    hits += 1
-                    if threshold_gaussian < 0 and transmittance < threshold:
-                        threshold_gaussian = index
-                        threshold_depth = buffer.t[k]
-        t_last = buffer.t[LAST]
-        index_last = buffer.index[LAST]
+        k = int(0)
+        while k < taken and transmittance >= settings.stop:
+            t = hit_time(buffer, k)
+            index = hit_index(buffer, k)
+            peak = ray_peak(occluders.gaussians, index, origin, direction)
+            if peak.alpha > 0.0:  # at the support's edge leaf and packed rows may round to different sides
+                weight = transmittance * peak.alpha
+                opacity += weight
+                depth += weight * t
+                normal += entry_normal(occluders.gaussians, index, origin, direction) * weight
+                for channel in range(channels):
+                    out_records.attributes[i, channel] += weight * attributes[index, channel]
+                transmittance *= 1.0 - peak.alpha
+                hits += 1
+                if threshold_gaussian < 0 and transmittance < threshold:
+                    threshold_gaussian = index
+                    threshold_depth = t
+            k += 1
+        t_last = hit_time(buffer, LAST)
+        index_last = hit_index(buffer, LAST)
         more = 0
         # A full buffer may have hidden others from view.
         if buffer.count >= BUFFER_SIZE and transmittance >= settings.stop:
@@ -218,5 +262,5 @@ def trace_surface_kernel(
     out_records.mesh_faces[i] = mesh.face
 
 
-launch_trace_surface = launcher(trace_surface_kernel, block_dim=64)
+launch_trace_surface = launcher(trace_surface_kernel, block_dim=HIT_THREADS)
 """Trace one ray a thread, front to back."""

@@ -35,7 +35,7 @@ def spread_bits(x: wp.int64) -> wp.int64:
     return b
 
 
-BOXES_A_THREAD = wp.constant(256)
+BOXES_A_THREAD = wp.constant(32)
 
 
 @wp.kernel

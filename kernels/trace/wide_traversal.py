@@ -61,7 +61,7 @@ def never_done(settings: TraceSettings, found: Any) -> bool:
     return False
 
 
-def traversal(name, visit, *, reach=whole_reach, is_done=never_done, ordered=False):
+def traversal(name, visit, *, reach=whole_reach, is_done=never_done, ordered=False, in_place=False):
     """Make the function that takes a ray through the wide tree and returns what it found.
 
     The stack holds (first node, axis, mask of what is left) in one number, 26, 2 and 4 bits, one a level. Children are
@@ -78,11 +78,14 @@ def traversal(name, visit, *, reach=whole_reach, is_done=never_done, ordered=Fal
         reach: ``reach(ray, found)`` returns how far nodes are looked for.
         is_done: ``is_done(settings, found)``, asked after each leaf, ends the traversal.
         ordered: Meet children from near to far along their node's axis.
+        in_place: ``visit`` and ``reach`` take ``found`` by `wp.ref`, and ``visit`` changes it and returns nothing: for
+            what is too large to be copied at every leaf.
 
     Returns:
         A Warp function of (tree, gaussians, settings, ray, found at the start).
     """
     Found = visit.input_types["found"]
+    Found = Found.value_type if in_place else Found
 
     @wp.func(name=name)
     def traverse(tree: WideTree, gaussians: Gaussians, settings: TraceSettings, ray: TracedRay, start: Found) -> Found:
@@ -112,7 +115,10 @@ def traversal(name, visit, *, reach=whole_reach, is_done=never_done, ordered=Fal
             axis = hits.axis
             leaf = hits.leaf
             while leaf != 0:
-                found = visit(tree, gaussians, settings, ray, found, hits.first_leaf + lowest_bit(leaf))
+                if wp.static(in_place):
+                    visit(tree, gaussians, settings, ray, found, hits.first_leaf + lowest_bit(leaf))
+                else:
+                    found = visit(tree, gaussians, settings, ray, found, hits.first_leaf + lowest_bit(leaf))
                 leaf = leaf & (leaf - 1)
                 if is_done(settings, found):
                     leaf = 0

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image as PillowImage
 from scipy.ndimage import gaussian_filter
-from support.discs import COLUMNS, RADIUS, SIDE, SUBJECT, WALL, before, disc
+from support.discs import COLUMNS, RADIUS, ROWS, SIDE, SUBJECT, WALL, before, disc
 from support.sound_capture import CAMERAS, save, write_sound
 
 from beam_warp.capture.capture import Capture
@@ -67,6 +67,19 @@ def test_a_sound_mask_stays_as_it_is(radius, center, subject, blur, seed):
     noise = np.random.default_rng(seed).normal(0.0, 0.01, photograph.shape)
     found = matte((photograph + noise).astype(np.float32), true)
     assert np.abs(found.alpha - true).max() < 0.05
+
+
+@pytest.mark.parametrize("pixels", [-1.0, 0.0])
+def test_a_dark_limb_is_doubted_where_it_looks_like_the_wall(pixels):
+    """A sixth of a disc darkens to the wall's colour over three pixels: what is bitten off there is told as a doubt."""
+    true, wall = disc(), np.broadcast_to(np.array([0.1, 0.1, 0.1], np.float32), WALL.shape)
+    row, column = ROWS - 47.3, COLUMNS - 48.6
+    away = np.clip((RADIUS - np.hypot(row, column)) / 3.0, 0.0, 1.0)[..., None]
+    is_dark = (np.abs(np.arctan2(row, column)) < np.pi / 6.0)[..., None]
+    found = matte(before(wall, true, np.where(is_dark, wall + away * (SUBJECT - wall), SUBJECT)), disc(RADIUS + pixels))
+    off = np.abs(found.alpha - true)
+    assert (off * (1.0 - found.doubt)).sum() < 0.08 * 2.0 * np.pi * RADIUS
+    assert not found.doubt[:, :48].any()
 
 
 def test_masks_without_an_outline_are_left_as_they_are():

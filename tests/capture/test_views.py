@@ -12,8 +12,8 @@ CAMERA = Camera(7, 5, 6.0, 5.0, 3.2, 2.4, np.eye(4))
 
 def view() -> CapturedView:
     rng = np.random.default_rng(0)
-    color, alpha = rng.random((5, 7, 3), np.float32), rng.random((5, 7), np.float32)
-    return CapturedView(name="a", camera=CAMERA, color=color, alpha=alpha)
+    color, alpha, doubt = (rng.random((5, 7, *more), np.float32) for more in ((3,), (), ()))
+    return CapturedView(name="a", camera=CAMERA, color=color, alpha=alpha, doubt=doubt)
 
 
 def test_a_point_of_a_crop_is_the_same_pixel():
@@ -23,6 +23,7 @@ def test_a_point_of_a_crop_is_the_same_pixel():
     np.testing.assert_allclose(part.camera.project(point)[0, :2], given.camera.project(point)[0, :2] - (2, 1))
     np.testing.assert_array_equal(part.color, given.color[1:4, 2:6])
     np.testing.assert_array_equal(part.alpha, given.alpha[1:4, 2:6])
+    np.testing.assert_array_equal(part.doubt, given.doubt[1:4, 2:6])
 
 
 def test_a_reduction_is_the_mean_of_its_pixels_and_its_camera_sees_them():
@@ -31,6 +32,7 @@ def test_a_reduction_is_the_mean_of_its_pixels_and_its_camera_sees_them():
     assert (half.camera.width, half.camera.height) == (3, 2)
     np.testing.assert_allclose(half.color[1, 2], given.color[2:4, 4:6].mean(axis=(0, 1)), rtol=1e-6)
     np.testing.assert_allclose(half.alpha[0, 1], given.alpha[0:2, 2:4].mean(), rtol=1e-6)
+    np.testing.assert_allclose(half.doubt[0, 1], given.doubt[0:2, 2:4].mean(), rtol=1e-6)
     point = np.array([[0.3, -0.2, 2.0]])
     np.testing.assert_allclose(half.camera.project(point)[0, :2], given.camera.project(point)[0, :2] / 2.0)
     assert view().reduced(1).camera.width == 7
@@ -49,6 +51,8 @@ def test_what_is_wrong_is_refused():
         CapturedView(name="a", camera=CAMERA, color=np.full((5, 7, 3), np.nan))
     with pytest.raises(InvalidArrayError, match="alpha"):
         CapturedView(name="a", camera=CAMERA, color=np.zeros((5, 7, 3)), alpha=np.full((5, 7), 1.5))
+    with pytest.raises(InvalidArrayError, match="doubt"):
+        CapturedView(name="a", camera=CAMERA, color=np.zeros((5, 7, 3)), doubt=np.full((5, 7), np.nan))
     with pytest.raises(InvalidArrayError, match="factor must leave a pixel"):
         view().reduced(6)
     with pytest.raises(InvalidOptionError, match="factor"):

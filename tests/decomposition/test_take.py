@@ -59,6 +59,18 @@ def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
     assert look(tmp_path / "two").stages["materials"].done == 4
 
 
+@pytest.mark.slow
+def test_processes_write_the_same_clips(tmp_path):
+    """Both assets of a take that is long enough to have clips, which are steps."""
+    capture = Capture.read(write_capture(tmp_path / "capture", range(64)))
+    take(capture, tmp_path / "one", FakeSteps(), 16)
+    two = take(capture, tmp_path / "two", FakeSteps(), 16, crew_of("2", "cpu"))
+    assert validate(two.result.asset).is_valid
+    assert look(tmp_path / "two").stages["asset-clip"].done == look(tmp_path / "two").stages["gaussians-clip"].done == 3
+    assert results(tmp_path / "one") == results(tmp_path / "two")
+    assert (tmp_path / "two" / "asset.000030.usdc").samefile(tmp_path / "two" / "clips" / "asset.000030.usdc")
+
+
 def test_materials_do_not_wait_for_other_segments(ball, tmp_path):
     take(ball, tmp_path / "out", FakeSteps(), 2)
     receipts = look(tmp_path / "out").receipts

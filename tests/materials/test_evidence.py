@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from reference.harmonics import sh_color
 from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles, unit
 
 from beam_warp.capture.views import CapturedView
+from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.kernels.materials.neighborhoods import launch_mean_of_face
 from beam_warp.materials.evidence import RADII, view_evidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.channels import RADIANCE
@@ -98,6 +101,58 @@ class TestSurface:
         offsets = SurfacePoints.seen_by(both, found, Scene.from_gaussians(both, device)).offsets.numpy()
         # thin tiles: 0.1 of 0.65 * 0.05 in deviation, and the upper layer's height above what is seen
         assert 0.0 < np.median(offsets[inside & found.seen]) < 0.03
+
+
+class TestFaces:
+    """Normals where light is gathered: crisp beside edges, no worse on what is smooth."""
+
+    @staticmethod
+    def tilted(normals, rng, by=0.08):
+        leaning = normals + by * rng.normal(size=normals.shape)
+        return leaning / np.linalg.norm(leaning, axis=1, keepdims=True)
+
+    @staticmethod
+    def degrees(cloud, device, truth):
+        cloud = colored(cloud, np.full((len(cloud), 3), 0.5))
+        found = view_evidence(cloud, around(12), device=device)
+        points = SurfacePoints.seen_by(cloud, found, Scene.from_gaussians(cloud, device))
+        seen = found.seen
+        return seen, *(
+            np.degrees(np.arccos(np.clip((normals.numpy()[seen] * truth[seen]).sum(axis=1), -1.0, 1.0)))
+            for normals in (points.normals, found.normals)
+        )
+
+    def test_an_edge_is_not_rounded(self, device, rng):
+        """A box of noisy discs as wide as pixels: beside its edges blends err by more than the axes do."""
+        spacing = 0.06
+        u, v = (side.ravel() for side in np.meshgrid(*2 * [np.arange(-0.57, 0.6, spacing)]))
+        sides = [np.insert(np.column_stack([u, v]), axis, 0.6 * sign, axis=1) for axis in range(3) for sign in (-1, 1)]
+        normals = [np.tile(sign * np.eye(3)[axis], (len(u), 1)) for axis in range(3) for sign in (-1, 1)]
+        points, truth = np.concatenate(sides), np.concatenate(normals)
+        box = cloud_of(tiles(points, self.tilted(truth, rng), spacing))
+        seen, crisp, blended = self.degrees(box, device, truth)
+        rim = np.sort(np.abs(points[seen]), axis=1)[:, 1] > 0.6 - 1.1 * spacing
+        assert rim.sum() > 300
+        assert np.mean(blended[rim]) > 10.0  # twice the noise of the axes, or this scene asks for nothing
+        assert np.mean(crisp[rim]) < 0.5 * np.mean(blended[rim])
+        assert np.mean(crisp[~rim]) < np.mean(blended[~rim]) + 0.5
+
+    def test_noise_on_a_sphere_is_no_larger(self, device, rng):
+        points, spacing = sphere_points(3000)
+        _, crisp, blended = self.degrees(cloud_of(tiles(points, self.tilted(points, rng), spacing)), device, points)
+        assert np.mean(crisp) < np.mean(blended) + 0.3
+
+    def test_means_of_faces_as_numpy_has_them(self, device, rng):
+        points, normals = rng.normal(size=(40, 3)), self.tilted(np.tile([0.0, 0.0, 1.0], (40, 1)), rng, 0.3)
+        weights, near = rng.uniform(0.1, 1.0, 40), np.argsort(np.linalg.norm(points[:, None] - points, axis=2))[:, :9]
+        found = wp.empty(40, dtype=wp.vec3, device=device)
+        arrays = upload(points, wp.vec3, device), upload(normals, wp.vec3, device), upload(weights, float, device)
+        launch_mean_of_face(40, *arrays, upload(near, int, device), 0.2, found, device)
+        reach = np.linalg.norm(points[near[:, -1]] - points, axis=1)[:, None]
+        apart = np.linalg.norm(points[near] - points[:, None], axis=2) / reach
+        turned = np.linalg.norm(normals[near] - normals[:, None], axis=2) / 0.2
+        mean = ((weights[near] * np.exp(-2.0 * apart**2 - 0.5 * turned**2))[..., None] * normals[near]).sum(axis=1)
+        np.testing.assert_allclose(found.numpy(), mean / np.linalg.norm(mean, axis=1, keepdims=True), atol=1e-5)
 
 
 class TestColors:

@@ -9,6 +9,7 @@ from support.moving_ball import ball_views
 from support.moving_ball import rig as cameras_around
 
 from beam_warp.capture.corrections import move_between, moved_camera
+from beam_warp.errors import AssetFormatError
 from beam_warp.reconstruction import rig
 from beam_warp.reconstruction.alignment import Evidence, flow_of
 from beam_warp.reconstruction.fit import FitOptions
@@ -121,6 +122,15 @@ def test_a_camera_that_is_met_much_worse_is_left_out(device, monkeypatch):
     assert too_few is not None
     assert not too_few.is_applied
     assert [camera.camera for camera in too_few.cameras if not camera.is_used] == ["c3"]
+
+
+def test_two_captures_in_one_are_refused(device, monkeypatch):
+    monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 3, 1, 1),))
+    one, other = (ball_views(cameras_around(8, 40), center=(0.0, 0.0, z)) for z in (0.0, 0.45))
+    mixed = [(one, other)[k % 2][k] for k in range(8)]
+    options = FitOptions.of_preset("draft", gaussian_count=500)
+    with pytest.raises(AssetFormatError, match="photographs must show one subject"):
+        refine_rig([f"c{k}" for k in range(8)], mixed, options, device=device)
 
 
 def test_moved_cameras_of_a_ball_come_nearer_with_the_same_bits(device, monkeypatch, points):

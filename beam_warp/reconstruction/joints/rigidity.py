@@ -62,6 +62,7 @@ class RigidityLoss:
         weight: float = 1.0,
         rotation_gradients: wp.array | None = None,
         position_gradients: wp.array | None = None,
+        value: bool = True,
     ) -> wp.array:
         """Return weight / (M s^2) sum_i sum_j w_ij |R_i R_i,p^T (x_i - x_j)_p - (x_i - x_j)|^2, and add its gradients.
 
@@ -77,6 +78,7 @@ class RigidityLoss:
             rotation_gradients: The derivative with respect to ``rotations`` is added to it, ``(M,)`` quat or vec4;
                 orthogonal to them, as their length changes nothing.
             position_gradients: The derivative with respect to ``positions`` is added to it, ``(M,)`` vec3.
+            value: Whether the sum is found; else what is returned is that of before.
 
         Raises:
             InvalidArrayError: An array has another type, length or device.
@@ -93,7 +95,8 @@ class RigidityLoss:
             None if position_gradients is None else self._vectors("position_gradients", position_gradients, 3),
             self.device,
         )
-        launch_sum_floats(self._terms, scale, self._sums, self._value, self.device)
+        if value:
+            launch_sum_floats(self._terms, scale, self._sums, self._value, self.device)
         return self._value
 
     def _vectors(self, name: str, value: wp.array, width: int) -> wp.array:

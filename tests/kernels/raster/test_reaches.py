@@ -1,0 +1,69 @@
+"""A warp of the CUDA composites looks at every splat that one of its pixels counts, and at few others."""
+
+import numpy as np
+import warp as wp
+
+from beam_warp.kernels.raster.bin_tiles import launch_order_tiles
+from beam_warp.kernels.raster.composite_cuda import HEIGHT, WIDTH, reaches
+from beam_warp.kernels.raster.project import LOG_CUT
+from beam_warp.kernels.raster.splat_rows import log_alpha_of, offset_from, whiten
+
+COUNT = 200_000
+
+
+@wp.kernel(enable_backward=False)
+def look_at_boxes_kernel(
+    centers: wp.array[wp.vec4], shapes: wp.array[wp.vec4], firsts: wp.array[wp.vec2], out_found: wp.array[wp.vec2i]
+):
+    """How many pixels of a box a splat counts for, and whether it reaches the box."""
+    i = wp.tid()
+    counted = wp.int32(0)
+    for k in range(WIDTH * HEIGHT):
+        pixel = firsts[i] + wp.vec2(float(k % WIDTH), float(k / WIDTH))
+        if log_alpha_of(centers[i], whiten(shapes[i], offset_from(centers[i], pixel))) >= -LOG_CUT:
+            counted += 1
+    out_found[i] = wp.vec2i(counted, reaches(centers[i], shapes[i], firsts[i], WIDTH, HEIGHT))
+
+
+def test_no_pixel_that_counts_is_passed_over(rng):
+    """Splats from points to needles of 3,000 pixels and 0.01, whose rims lie about the boxes, wherever these are."""
+    long = 10.0 ** rng.uniform(-2.0, 3.5, COUNT)
+    thin, low_pass = long * 10.0 ** rng.uniform(-5.0, 0.0, COUNT), 10.0 ** rng.uniform(-4.0, -0.5, COUNT)
+    angle, around = rng.uniform(0.0, 2.0 * np.pi, (2, COUNT))
+    xx, yy = ((long * one) ** 2 + (thin * other) ** 2 + low_pass for one, other in _turns(angle))
+    xy = (long**2 - thin**2) * np.sin(angle) * np.cos(angle)
+    shapes = np.stack([1.0 / np.sqrt(xx), xy / xx, np.sqrt(xx / (xx * yy - xy * xy)), long], axis=1)
+    rim = 3.3 * rng.uniform(0.0, 1.15, COUNT) * np.stack([long * np.cos(around), thin * np.sin(around)])
+    sideways = np.stack(
+        [rim[0] * np.cos(angle) - rim[1] * np.sin(angle), rim[0] * np.sin(angle) + rim[1] * np.cos(angle)]
+    )
+    firsts = np.floor(rng.uniform(0.0, 1000.0, (COUNT, 2))) + 0.5
+    places = firsts - sideways.T + rng.uniform(0.0, (WIDTH - 1.0, HEIGHT - 1.0), (COUNT, 2))
+    centers = np.c_[places, np.log(rng.uniform(1.01 / 255.0, 1.0, COUNT)), np.ones(COUNT)]
+    given = ((centers, wp.vec4), (shapes, wp.vec4), (firsts, wp.vec2))
+    arrays = [wp.array(rows.astype(np.float32), dtype=dtype, device="cpu") for rows, dtype in given]
+    out = wp.zeros(COUNT, dtype=wp.vec2i, device="cpu")
+    wp.launch(look_at_boxes_kernel, COUNT, inputs=arrays, outputs=[out], device="cpu")
+    counted, reached = out.numpy().T
+    assert (counted > 0).mean() > 0.5
+    assert not ((counted > 0) & (reached == 0)).any()
+    far = np.abs(places - firsts).max(axis=1) > 3.4 * np.sqrt(np.maximum(xx, yy)) + WIDTH + 1.0
+    assert not reached[far].any()
+
+
+def _turns(angle):
+    """Cosine and sine of an angle, and the other way round."""
+    return ((np.cos(angle), np.sin(angle)), (np.sin(angle), np.cos(angle)))
+
+
+def test_tiles_of_long_lists_are_drawn_first(rng):
+    """Each tile once, those above five times the mean before all others."""
+    lengths = np.where(rng.uniform(size=1000) < 0.05, 900, rng.integers(0, 60, 1000))
+    ends = np.cumsum(lengths)
+    ranges = wp.array(np.stack([ends - lengths, ends], axis=1), dtype=wp.vec2i, device="cpu")
+    counts, order = wp.zeros(2, dtype=int, device="cpu"), wp.zeros(1000, dtype=int, device="cpu")
+    launch_order_tiles(1000, ranges, wp.array(ends[-1:], dtype=int, device="cpu"), counts, order, "cpu")
+    assert sorted(order.numpy()) == list(range(1000))
+    long = lengths[order.numpy()] > 5 * lengths.mean()
+    assert long.sum() == counts.numpy()[0] > 0
+    assert long[: long.sum()].all()
