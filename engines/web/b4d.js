@@ -165,42 +165,38 @@ function split(content, file, frames, count) {
   return tracks;
 }
 
-/** Return the whole numbers of a plane: 0, 1, 2, 3, 4 … stand for 0, -1, 1, -2, 2 …. Loops that meet one kind of array are fast. */
+/** Return the whole numbers of a plane: 0, 1, 2, 3, 4 … stand for 0, -1, 1, -2, 2 …. */
 function plane(octets, count, size, isSummed) {
   require(size >= 1 && size <= 4, "planes must have 1 to 4 bytes", size);
-  if (size > 1 || isSummed) return unfolded([0, 1, 2, 3].map((k) => (k < size ? octets.subarray(k * count) : new Uint8Array(count))), isSummed ? -1 : 0, count);
-  const numbers = new Int8Array(count);
-  for (let i = 0; i < count; i++) numbers[i] = (octets[i] >>> 1) ^ -(octets[i] & 1);
-  return numbers;
-}
-
-function unfolded([a, b, c, d], kept, count) { // kept: all bits of the sum so far, or none
-  const numbers = new Float32Array(count);
+  const numbers = isSummed || size > 1 ? new Float32Array(count) : new Int8Array(count);
   for (let i = 0, sum = 0; i < count; i++) {
-    const code = a[i] | b[i] << 8 | c[i] << 16 | d[i] << 24;
-    numbers[i] = sum = ((sum & kept) + ((code >>> 1) ^ -(code & 1))) | 0;
+    let code = octets[i];
+    for (let order = 1; order < size; order++) code |= octets[order * count + i] << (8 * order);
+    const number = (code >>> 1) ^ -(code & 1);
+    numbers[i] = isSummed ? (sum = (sum + number) | 0) : number;
   }
   return numbers;
 }
 
 /** Return offset plus weights times planes for each component, plus what the static block says. */
 function valuesAt(track, frame, count, start) {
-  const values = new Float32Array(track.length * count);
-  track.forEach(({columns, weights, planes}, c) => {
-    const part = (all) => all.subarray(c * count, (c + 1) * count), out = part(values);
-    const row = weights.subarray(frame * columns, (frame + 1) * columns), isWide = ([numbers]) => numbers instanceof Float32Array;
-    const used = planes.map((numbers, k) => [numbers, row[1 + k]]).filter(([, weight]) => weight), wide = used.filter(isWide);
-    for (let n = 0; n < Math.max(wide.length, 1); n += 4) {
-      const [[a, p], [b, q], [d, r], [e, s]] = [0, 1, 2, 3].map((k) => wide[n + k] ?? [out, 0]);
-      blend(out, n || !start ? out : part(start), n ? 0 : row[0], a, b, d, e, p, q, r, s);
+  const values = new Float32Array(track.length * count), none = new Int8Array(count);
+  track.forEach(({columns, weights, planes, first}, c) => {
+    const out = values.subarray(c * count, (c + 1) * count), row = weights.subarray(frame * columns, (frame + 1) * columns);
+    const plain = planes.map((_, k) => k).filter((k) => k >= first && row[1 + k]);
+    let from = start ? start.subarray(c * count, (c + 1) * count) : out;
+    for (let n = 0; n < Math.max(Math.ceil(first / 3), plain.length, 1); n++, from = out) {
+      const [a, b, d] = [0, 1, 2].map((j) => (3 * n + j < first ? planes[3 * n + j] : out));
+      const [p, q, r] = [1, 2, 3].map((j) => (3 * n + j <= first ? row[3 * n + j] : 0));
+      blend(out, from, n ? 0 : row[0], a, b, d, p, q, r, planes[plain[n]] ?? none, row[1 + plain[n]] ?? 0);
     }
-    for (const [numbers, weight] of used) if (!isWide([numbers])) addOctets(out, numbers, weight);
   });
   return values;
 }
 
-const blend = (out, from, offset, a, b, c, d, p, q, r, s) => { for (let i = 0; i < out.length; i++) out[i] = from[i] + offset + p * a[i] + q * b[i] + r * c[i] + s * d[i]; };
-const addOctets = (out, numbers, weight) => { for (let i = 0; i < out.length; i++) out[i] += weight * numbers[i]; };
+function blend(out, from, offset, a, b, c, p, q, r, plain, s) {
+  for (let i = 0; i < out.length; i++) out[i] = from[i] + offset + p * a[i] + q * b[i] + r * c[i] + s * plain[i];
+}
 
 /** Turn numbers of an array into what they stand for, in place where that is possible. */
 function activated(name, values) {
@@ -231,14 +227,17 @@ function quaternions(values, count) {
 
 /** Turn orientations, and normals where there are any, by modified Rodrigues parameters. */
 function turn(arrays, turns, count) {
-  const from = arrays.orientations, to = new Float32Array(4 * count), normals = arrays.normals, turned = normals && new Float32Array(3 * count);
+  const from = arrays.orientations, to = new Float32Array(4 * count), normals = arrays.normals;
+  const turned = normals && new Float32Array(3 * count);
   for (let i = 0, j = count, k = 2 * count, l = 3 * count; i < count; i++, j++, k++, l++) {
     const s = turns[i] * turns[i] + turns[j] * turns[j] + turns[k] * turns[k], share = 1 / (1 + s);
-    const a = 2 * turns[i] * share, b = 2 * turns[j] * share, c = 2 * turns[k] * share, d = (1 - s) * share, x = from[i], y = from[j], z = from[k], w = from[l];
+    const a = 2 * turns[i] * share, b = 2 * turns[j] * share, c = 2 * turns[k] * share, d = (1 - s) * share;
+    const x = from[i], y = from[j], z = from[k], w = from[l];
     to[i] = d * x + a * w + b * z - c * y, to[j] = d * y + b * w + c * x - a * z;
     to[k] = d * z + c * w + a * y - b * x, to[l] = d * w - a * x - b * y - c * z;
     if (!normals) continue;
-    const u = normals[i], v = normals[j], n = normals[k], p = 2 * (b * n - c * v), q = 2 * (c * u - a * n), r = 2 * (a * v - b * u);
+    const u = normals[i], v = normals[j], n = normals[k];
+    const p = 2 * (b * n - c * v), q = 2 * (c * u - a * n), r = 2 * (a * v - b * u);
     turned[i] = u + d * p + b * r - c * q, turned[j] = v + d * q + c * p - a * r, turned[k] = n + d * r + a * q - b * p;
   }
   arrays.orientations = to;
