@@ -11,13 +11,6 @@ from tables import Row, Rows, cell, figure, table
 REDUCE = "reduce_h200.json"
 
 
-def means(result: Row, share: float, contender: str, part: str, number: str) -> float | None:
-    """Return a number of a contender, the mean over assets; None where it could not be measured."""
-    rows = [row for row in result["sizes"]["rows"] if (row["share"], row["contender"]) == (share, contender)]
-    found = [row[part][number] for row in rows if part in row]
-    return sum(found) / len(found) if found else None
-
-
 def told_apart(rows: Iterable[Row], key: str) -> list[Any]:
     """Return the values of a key, in the order in which they come."""
     return list(dict.fromkeys(row[key] for row in rows))
@@ -25,27 +18,15 @@ def told_apart(rows: Iterable[Row], key: str) -> list[Any]:
 
 @table("reduce_sizes", REDUCE)
 def sizes(result: Row) -> Rows:
-    """Return PSNR against the original and loss against the truth of every contender, the mean over assets."""
-    head = ["kept", "by", "PSNR [dB]", "loss [dB]", "refitted: PSNR [dB]", "loss [dB]", "counted loss [dB]"]
+    """Return PSNR against the original and loss against the truth of every contender, by asset."""
+    head = ["asset", "kept", "by", "PSNR [dB]", "loss [dB]", "refitted: PSNR [dB]", "loss [dB]", "counted loss [dB]"]
     rows: list[list[Any]] = [head]
-    for share in told_apart(result["sizes"]["rows"], "share"):
-        for contender in told_apart(result["sizes"]["rows"], "contender"):
+    for row in result["sizes"]["rows"]:
+        if "refit" in row:
             numbers = (("bare", "psnr", ".1f"), ("bare", "truth_loss", ".2f"), ("refit", "psnr", ".1f"))
             numbers = (*numbers, ("refit", "truth_loss", ".2f"), ("refit", "loss", ".2f"))
-            found = [cell(means(result, share, contender, part, name), form) for part, name, form in numbers]
-            rows.append([f"{share:.0%}", contender, *found])
-    return rows
-
-
-@table("reduce_truth", REDUCE)
-def truths(result: Row) -> Rows:
-    """Return what `beam reduce` loses by asset."""
-    ours = [row for row in result["sizes"]["rows"] if row["contender"] == "beam reduce" and "refit" in row]
-    rows: list[list[Any]] = [["asset", "against the truth [dB]", "kept", "PSNR [dB]", "loss [dB]", "counted loss [dB]"]]
-    for row in sorted(ours, key=lambda row: (-row["share"], row["asset"])):
-        found = (row["refit"]["psnr"], row["refit"].get("truth_loss"), row["refit"]["loss"])
-        cells = [cell(value, form) for value, form in zip(found, (".1f", ".2f", ".2f"), strict=True)]
-        rows.append([row["asset"], cell(row["truth"], ".1f"), f"{row['share']:.0%}", *cells])
+            found = [cell(row[part].get(name), form) for part, name, form in numbers]
+            rows.append([row["asset"], f"{row['share']:.0%}", row["contender"], *found])
     return rows
 
 
