@@ -50,6 +50,7 @@ from beam_warp.converters import read, write
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
+from beam_warp.errors import BeamError
 from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, loss_of
 from beam_warp.evaluate.trials import RelitTrials
@@ -248,7 +249,7 @@ def sizes(bench: Bench) -> Iterator[Row]:
                 count = round(share * len(cloud))
                 try:
                     rows.append(row | contend(keep, reducer, cloud, count, place, judge))
-                except (npm_packages.MissingPackagesError, subprocess.SubprocessError) as error:
+                except (npm_packages.MissingPackagesError, subprocess.SubprocessError, BeamError) as error:
                     rows.append(row | {"absent": str(error)})
                 bench.say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
                 yield {"rows": rows, "height": bench.options.height, "tests": bench.tests}
