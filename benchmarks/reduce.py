@@ -49,6 +49,7 @@ from beam_warp.converters import read, write
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
+from beam_warp.errors import BeamError
 from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, loss_of
 from beam_warp.evaluate.trials import RelitTrials
@@ -71,6 +72,8 @@ Keep = Callable[[Reducer, GaussianCloud, int, Path | None], GaussianCloud]
 
 FRESH, FRESH_PAIRS = 77, 200
 """Seed and number of draws that no search and no certificate saw."""
+
+DEFAULT_STEPS = ReduceOptions(gaussians=1).steps
 
 MOST_LOSS = 1.0
 """Bound that the fewest Gaussians are asked for [dB]."""
@@ -238,23 +241,24 @@ def sizes(bench: Bench) -> Iterator[Row]:
                 place = None if bench.made is None else bench.made / f"{name}_{share:g}.ply"
                 count = round(share * len(cloud))
                 try:
-                    rows.append(row | contend(functools.partial(keep, place=place), reducer, cloud, count, judge))
-                except (npm_packages.MissingPackagesError, subprocess.SubprocessError) as error:
+                    rows.append(row | contend(keep, reducer, cloud, count, place, judge))
+                except (npm_packages.MissingPackagesError, subprocess.SubprocessError, BeamError) as error:
                     rows.append(row | {"absent": str(error)})
                 say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
                 yield {"rows": rows, "height": bench.options.height, "tests": bench.tests}
 
 
 def contend(
-    keep: Callable[[Reducer, GaussianCloud, int], GaussianCloud],
+    keep: Keep,
     reducer: Reducer,
     cloud: GaussianCloud,
     count: int,
+    place: Path | None,
     judge: Callable[[GaussianCloud], Row],
 ) -> Row:
     """Measure one contender, as it is and refitted."""
     started = time.perf_counter()
-    bare = keep(reducer, cloud, count)
+    bare = keep(reducer, cloud, count, place)
     chosen = time.perf_counter()
     turn = Rotation.identity(len(bare))
     how = {"steps": reducer.options.steps, "raster": reducer.raster, "device": reducer._device}
@@ -272,7 +276,8 @@ def certified(bench: Bench) -> Iterator[Row]:
         original = asset(name, bench)
         truth = against_truth(name, original, bench) or ASSET_PSNR
         for target in ({"gaussians": round(bench.shares[0] * len(original[0]))}, {"max_loss": MOST_LOSS}):
-            options = ReduceOptions(**target, asset_psnr=truth, height=height, device=bench.device)
+            changes: Row = {"gaussians": None, "asset_psnr": truth, "height": height, **target}
+            options = replace(bench.options, steps=min(DEFAULT_STEPS, bench.options.steps), **changes)
             rows.append({"name": f"{name} {target}", "asset": name, "target": target, "asset_psnr": truth})
             with tempfile.TemporaryDirectory() as folder:
                 started = time.perf_counter()

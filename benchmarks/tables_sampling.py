@@ -71,6 +71,19 @@ def economy_light(result: Row) -> Rows:
     return rows
 
 
+@table("economy_large", "economy_h200.json")
+def economy_large(result: Row) -> Rows:
+    """Light of large frames by the default target, beside as many rays for each."""
+    rows: list[list[Any]] = [["", "Gaussians lit", "rays", "error", "the same for each", "faster", "base colour"]]
+    for name, found in result["captures"].items():
+        row = step(found["light"]["rows"], "target_0.05")
+        same = next(each for each in found["light"]["rows"] if "scores" in each)
+        lost = row["scores"]["base_color"] - same["scores"]["base_color"]
+        cells = [f"{row['rays']:.0f}", f"{100 * row['rmse']:.1f} %", f"{row['equal_rays']:.0f}"]
+        rows.append([name, f"{found['points']:,}", *cells, f"{row['faster']:.2f} ×", f"{lost:+.3f} dB"])
+    return rows
+
+
 @table("economy_occlusion", "economy_cpu.json")
 def economy_occlusion(result: Row) -> Rows:
     """Occlusion by the same rule, on every subject."""

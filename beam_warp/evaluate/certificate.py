@@ -52,7 +52,7 @@ class Certificate:
         first: Number of the first draw.
         mean: Mean error, with the ends of its interval of the same confidence by Student's t.
         psnr: Mean PSNR against the original [dB].
-        asset_psnr: The original's PSNR against the truth, which ``loss`` is counted from [dB]; nobody measures it again.
+        asset_psnr: The original's PSNR against the truth, from which ``loss`` counts [dB]; it is not measured again.
         distribution: Lights by digest, image height, seed.
         original: Digest of the original.
         asset: Digest of the asset.

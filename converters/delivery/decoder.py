@@ -23,7 +23,7 @@ COMPONENTS |= {f"radiance_{k}": 3 for k in range(25)}
 REQUIRED = {"positions", "orientations", "scales", "opacities"}
 MAX_FRAMES, FREE_BYTES, MAX_RATIO = 30, 2**24, 64  # of a segment; b bytes unpack to FREE_BYTES + MAX_RATIO b
 FREE_COUNT = 2**18  # Gaussians; more need a byte each in the static block
-LARGEST, BLOCK = 1e6, 2**14  # offset or weight: squares stay finite in float32; Gaussians that a cache holds
+LARGEST = 1e6  # offset or weight: sums and squares of values stay finite in float32
 
 Float32 = NDArray[np.float32]
 Arrays = dict[str, Float32]
@@ -52,12 +52,12 @@ class Component:
     summed: Float32  # (S, N), the first planes, which all frames use
     plain: list[NDArray[np.signedinteger]]  # the others, P of (N,); most have a weight in one frame only
 
-    def at(self, frame: int, part: slice = slice(None)) -> Float32:
-        """Return the numbers of some Gaussians at a frame of the block, ``(N,)``."""
+    def at(self, frame: int) -> Float32:
+        """Return the numbers at a frame of the block, ``(N,)``."""
         offset, first, last = np.split(self.weights[frame], [1, 1 + len(self.summed)])
-        values = first @ self.summed[:, part] + offset
+        values = first @ self.summed + offset
         for plane in np.flatnonzero(last):
-            values += self.plain[plane][part] * last[plane]
+            values += self.plain[plane] * last[plane]
         return values
 
 
@@ -117,8 +117,10 @@ class Container:
             _require(len(content) == size, f"it must unpack to {size} bytes", len(content))
             return _tracks(content, frames, self.manifest["count"])
         except (zlib.error, struct.error, KeyError, TypeError, ValueError, RecursionError) as error:
-            why = " ".join(str(error).split())[:160]
-            raise DeliveryError(f"{name} must be a sound block, got a broken one ({why}). Export it again.") from None
+            reason = " ".join(str(error).split())[:160]
+            raise DeliveryError(
+                f"{name} must be a sound block, got a broken one ({reason}). Export it again."
+            ) from None
 
     def frame(self, number: int) -> Arrays:
         """Return the arrays of a frame by name, ``(C, N)``: quaternions xyzw, linear scales, unit normals."""
@@ -129,27 +131,25 @@ class Container:
             tracks = self.tracks(segments[index], segments[index]["frames"])
             self._unpacked = index, tracks
         at = number - segments[index]["first"]
-        found: Arrays = {}
-        for start in range(0, self.manifest["count"], BLOCK):
-            part = slice(start, start + BLOCK)
-            raw = {name: np.stack([each.at(at, part) for each in track]) for name, track in tracks.items()}
-            for name in raw.keys() & self._raw.keys():
-                raw[name] += self._raw[name][:, part]
-            turn = quaternions(raw.pop("turns")) if "turns" in raw else None
-            arrays = {name: activated(name, values) for name, values in raw.items()}
-            for name, turned in (("orientations", product), ("normals", rotated)):
-                if turn is not None and (name in arrays or name in self.still):
-                    arrays[name] = turned(turn, arrays[name] if name in arrays else self.still[name][:, part])
-            for name, values in arrays.items():
-                found.setdefault(name, np.empty((len(values), self.manifest["count"]), np.float32))[:, part] = values
-        return self.still | found
+        raw = {name: np.stack([each.at(at) for each in track]) for name, track in tracks.items()}
+        for name in raw.keys() & self._raw.keys():
+            raw[name] += self._raw[name]
+        turn = quaternions(raw.pop("turns")) if "turns" in raw else None
+        arrays = self.still | {name: activated(name, values) for name, values in raw.items()}
+        if turn is not None:
+            arrays["orientations"] = product(turn, arrays["orientations"])
+            if "normals" in arrays:
+                arrays["normals"] = rotated(turn, arrays["normals"])
+        return arrays
 
 
 def _check(said: Any) -> None:
     """Refuse a manifest whose numbers and names cannot be right."""
     _require((said.get("format"), said.get("version")) == ("b4d", 1), "version must be 1 of b4d", said.get("version"))
-    rate, static, segments, following = said.get("rate"), said.get("static"), said.get("segments"), 0
-    _require(type(rate) in (int, float) and 1e-3 <= rate <= 1e6, "rate must be a rate", rate)
+    _require(
+        type(said.get("rate")) in (int, float) and 1e-3 <= said["rate"] <= 1e6, "rate must be a rate", said.get("rate")
+    )
+    static, segments, following = said.get("static"), said.get("segments"), 0
     _require(isinstance(static, dict) and isinstance(segments, list), "static and segments must be there", static)
     for entry in (static, *segments):
         name = entry.get("file") if isinstance(entry, dict) else entry

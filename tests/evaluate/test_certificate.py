@@ -54,6 +54,7 @@ def test_shares_are_covered_as_often_as_is_stated():
 
 def test_independent_errors_as_large_as_those_there_cost_three_decibels():
     assert loss_of(np.array([35.0]))[0] == pytest.approx(10.0 * np.log10(2.0))
+    assert loss_of(np.array([29.0]), 29.0)[0] == pytest.approx(10.0 * np.log10(2.0))
 
 
 def test_a_certificate_reads_back():

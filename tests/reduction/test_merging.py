@@ -1,10 +1,12 @@
 """Clusters are found in the order of their cost in relit images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from beam_warp.reduction.merging import MergeOrder
-from beam_warp.reduction.sensitivity import Sensitivity
+from beam_warp.reduction.merging import FLOOR, SPREAD, MergeOrder
+from beam_warp.reduction.sensitivity import Sensitivity, material_rows
 from beam_warp.world.gaussians import GaussianCloud
 
 SIDE = 12
@@ -44,6 +46,21 @@ def test_fewer_clusters_are_unions_of_more_and_the_order_does_not_depend_on_who_
     assert len(set(zip(many, few, strict=True))) == 40
     np.testing.assert_array_equal(few, again.labels(9))
     np.testing.assert_array_equal(many, again.labels(40))
+
+
+def test_a_pair_costs_what_ward_says_of_relit_images():
+    rng, cloud, found = np.random.default_rng(0), floor(), even(SIDE * SIDE)
+    halves = rng.normal(size=(len(cloud), 8, 8)).astype(np.float32)
+    found = replace(found, materials=halves @ halves.transpose(0, 2, 1), visible=rng.uniform(1.0, 9.0, len(cloud)))
+    cloud = cloud.with_arrays(base_color=rng.uniform(size=(len(cloud), 3)), roughness=rng.uniform(size=len(cloud)))
+    pairs, costs = MergeOrder([cloud], found)._costs()
+    rows, (one, two) = material_rows(cloud), pairs[7]
+    away, places = rows[one] - rows[two], cloud.positions[one] - cloud.positions[two]  # on a floor: all along it
+    weights, total = found.visible, found.visible[one] + found.visible[two]
+    form = away @ (found.materials[one] + found.materials[two]) @ away
+    edges = 2e-3 + FLOOR * total
+    expected = weights[one] * weights[two] / total**2 * (form + edges * SPREAD * np.square(places).sum())
+    assert costs[7] == pytest.approx(expected, rel=1e-4)
 
 
 def test_what_looks_different_is_merged_last():
