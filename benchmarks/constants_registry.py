@@ -511,7 +511,7 @@ UNTUNED = {
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
         ImagePathOptions: occlusion_samples light_samples offset steps
-        beam_warp.kernels.render.cluster_bounces: MEAN_COSINE
+        beam_warp.kernels.render.cluster_bounces: MEAN_COSINE INVERSE_PI PARTS
         beam_warp.kernels.render.gaussian_light: TAU
         beam_warp.kernels.render.shadow_maps: ROUNDING
         beam_warp.render.shadow_maps: FACE_ANGLE FAR NEAR

@@ -56,6 +56,27 @@ def kills(processes: Row, cluster: Row) -> Rows:
     return rows
 
 
+@table("scale_workers", "workers_h200x2.json")
+def workers(result: Row) -> Rows:
+    """Return what a take costs one process and one on each GPU, and how long each kind of step takes."""
+    kinds = ("frame", "materials", "preview")
+    rows: list[list[Any]] = [
+        ["GPUs", "seconds of steps", "busy", "frames an hour a GPU", "efficiency", *(f"{kind} [s]" for kind in kinds)]
+    ]
+    for row in result["take"]["rows"]:
+        rows.append(
+            [
+                row["workers"],
+                cell(row["working"], ".1f"),
+                f"{row['busy']:.0%}",
+                cell(row["frames_per_hour_a_worker"], ".0f"),
+                f"{row.get('efficiency', 1.0):.0%}",
+                *(cell(row["steps"][kind]["median"], ".1f") for kind in kinds),
+            ]
+        )
+    return rows
+
+
 @table("scale_memory", "memory_h200.json")
 def memory(result: Row) -> Rows:
     """Return what a process holds after the first tenth of a take and at its end."""

@@ -155,7 +155,7 @@ def matte(
     offset, common, own = _believed(excess, error)
     whole = _moved(mask, outline, np.full(len(own), common))
     parts = _moved(mask, outline, common + own) if own.any() else whole
-    alpha = 0.5 * (whole + parts)
+    alpha = (0.5 * (whole + parts)).astype(np.float32)
     color = photograph * alpha[..., None]
     color[at] = _subject(seen[at], alpha[at], inner, outer, outline.nearest)
     return Matte(color, alpha, offset, np.abs(whole - parts))
