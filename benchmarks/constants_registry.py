@@ -515,6 +515,7 @@ UNTUNED = {
         beam_warp.kernels.render.gaussian_light: TAU
         beam_warp.kernels.render.shadow_maps: ROUNDING
         beam_warp.render.shadow_maps: FACE_ANGLE FAR NEAR
+        beam_warp.render.pictures: BLACK
         beam_warp.render.sheet: WHITE_IRRADIANCE""",
     "what a user asks for, or the quality that a user pays for": """
         FitOptions: gaussian_count seed

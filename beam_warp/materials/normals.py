@@ -46,8 +46,9 @@ edge of 40 degrees lets next to nothing through."""
 
 FACE_PASSES = 2
 
-LEAST_TOWARDS = 0.3
-"""Cosine to the normal that pixels see from which on a Gaussian's own axis can be that of the surface there."""
+LEAST_TOWARDS = 0.7
+"""Cosine to the normal that pixels see from which on a Gaussian's own axis can be that of the surface there: a
+blend of two faces that meet at a right angle is half of that away from either."""
 
 
 @dataclass(frozen=True)

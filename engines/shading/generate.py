@@ -173,6 +173,11 @@ def head() -> str:
     return HEAD.replace("DIGEST", digest[:16])
 
 
+def bare(text: str) -> str:
+    """Return a shader without its comments: pages load it, and `relight.slang` has them."""
+    return re.sub(r"^ *//.*\n", "", text, flags=re.MULTILINE)
+
+
 def files(compiler: Path) -> dict[Path, str]:
     """Return the text of every generated file."""
     wgsl, glsl, hlsl = (shader(compiler, target) for target in TARGETS)
@@ -184,7 +189,7 @@ def files(compiler: Path) -> dict[Path, str]:
     }
     hooks = "".join(f"//     {each}\n" for each in HOOKS.values())
     script = [head() + "\n//\n// Hooks, in words of HLSL:\n" + hooks.rstrip()]
-    script += [f"/** {said} */\nexport const {name} = `\n{text}\n`;" for name, (said, text) in exports.items()]
+    script += [f"/** {said} */\nexport const {name} = `\n{bare(text)}\n`;" for name, (said, text) in exports.items()]
     guarded = f"#ifdef RELIGHT_FETCHING // define it, and the hooks\n\n{hlsl.fetching}\n\n#endif"
     header = [head(), "#ifndef BEAM_RELIGHT_INCLUDED\n#define BEAM_RELIGHT_INCLUDED", hlsl.pure, guarded, "#endif"]
     return {JAVASCRIPT: "\n\n".join(script) + "\n", HLSL: "\n\n".join(header) + "\n"}

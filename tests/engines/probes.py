@@ -53,7 +53,7 @@ ROTATION = 40.0
 
 OPTIONS = DeferredOptions(environment_shadows=0, bounces=0, light_map_size=MAP_SIZE)
 REGIONS = replace(OPTIONS, environment_shadows=16, environment_map_size=MAP_SIZE)
-"""With shadows of the environment: a map of each of its regions."""
+"""The same with shadows of the environment: a map of each of its regions."""
 
 TAPS = (16, 32)
 
