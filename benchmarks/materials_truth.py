@@ -165,17 +165,17 @@ class PerfectFrame:
 
     def points(self, offset: Any = "auto", *, exact: bool = True) -> SurfacePoints:
         """Return the Gaussians' own points and normals, which are the mesh's, or those that views see."""
-        evidence = self.evidence
-        if exact:
-            assert self.cloud.normals is not None
-            device = self.scene.device
-            evidence = replace(
-                evidence,
-                positions=wp.array(self.cloud.positions, dtype=wp.vec3, device=device),
-                normals=wp.array(self.cloud.normals, dtype=wp.vec3, device=device),
-                agreement=wp.full(len(self.cloud), 1.0, dtype=float, device=device),
-            )
-        return SurfacePoints.seen_by(self.cloud, evidence, self.scene, offset)
+        if not exact:
+            return SurfacePoints.seen_by(self.cloud, self.evidence, self.scene, offset)
+        assert self.cloud.normals is not None
+        device = self.scene.device
+        evidence = replace(
+            self.evidence,
+            positions=wp.array(self.cloud.positions, dtype=wp.vec3, device=device),
+            normals=wp.array(self.cloud.normals, dtype=wp.vec3, device=device),
+            agreement=wp.full(len(self.cloud), 1.0, dtype=float, device=device),
+        )
+        return replace(SurfacePoints.seen_by(self.cloud, evidence, self.scene, offset), normals=evidence.normals)
 
     def images_spread_back(self) -> ViewEvidence:
         """Return what views show if images are spread back as they are."""

@@ -29,6 +29,7 @@ STAGES = {
     "launch_count_pairs": "count and emit",
     "launch_emit_pairs": "count and emit",
     "launch_find_ranges": "ranges",
+    "launch_order_tiles": "ranges",
     "launch_composite_cpu": "composite",
     "launch_composite_cuda": "composite",
     "launch_composite_adjoint_cpu": "composite adjoint",
