@@ -51,7 +51,7 @@ def draw_growth(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     for row, (part, called) in zip(panels, PARTS.items(), strict=True):
         for axes, series in zip(row, ("gaussians", "pixels"), strict=True):
             for result in results:
-                for way in ON_CPU if result["machine"]["device"] == "cpu" else ON_CUDA:
+                for way in ON_CPU if result["measured"]["machine"]["device"] == "cpu" else ON_CUDA:
                     _draw_line(axes, result["growth"][series], series, part, way, device_name(result))
             sizes = [f"{device_name(result)} {_still(result['growth'][series], series)}" for result in results]
             axes.set(ylabel="time [ms]", xlabel=_axis_label(series))
@@ -99,7 +99,7 @@ def draw_stages(results: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def device_name(result: Mapping[str, Any]) -> str:
     """Return how a result's device is called in a legend."""
-    machine = result["machine"]
+    machine = result["measured"]["machine"]
     return "CPU" if machine["device"] == "cpu" else machine["device"].removeprefix("NVIDIA ")
 
 

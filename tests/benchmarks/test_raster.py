@@ -171,7 +171,7 @@ def test_everything_is_measured(device, tmp_path):
     assert [row["splats"] for row in result["growth"]["gaussians"]] == [100, 300]
     assert [row["width"] for row in result["growth"]["pixels"]] == [16, 24]
     for draw_one in (draw_growth, draw_stages):
-        draw_one([result], tmp_path / "plot.png")
+        draw_one([result | {"measured": {"machine": {"device": device}}}], tmp_path / "plot.png")
         assert (tmp_path / "plot.png").stat().st_size > 10_000
 
 
