@@ -84,9 +84,16 @@ def remove_leftovers(*folders: Path) -> list[str]:
 
 
 def is_alive(process: int) -> bool:
-    """Return whether a process of this machine runs; where that cannot be asked, it does."""
+    """Return whether a process of this machine runs; where that cannot be asked, it does.
+
+    A process that has ended keeps its number until its parent asks how. In a container whose first process never asks,
+    that is for ever: so Linux is asked for the state, too.
+    """
     if sys.platform == "win32":
         return True
+    with suppress(OSError, IndexError):
+        if Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[0] in "ZX":
+            return False
     try:
         os.kill(process, 0)
     except ProcessLookupError:
