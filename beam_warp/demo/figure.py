@@ -151,7 +151,9 @@ def build_figure(spacing: float = 0.011) -> Figure:
     """
     step = require_number("spacing", spacing, 0.006, 0.02)
     counts = np.ceil((UPPER - LOWER) / step).astype(int) + 1
-    vertices, faces, _, _ = marching_cubes(rest_field(LOWER, counts, step), 0.0, spacing=(step,) * 3)
+    vertices, faces, _, _ = marching_cubes(
+        rest_field(LOWER, counts, step), 0.0, spacing=(step,) * 3, allow_degenerate=False
+    )
     points = _onto_surface(vertices + LOWER)
     color, roughness = paint(points)
     rest = MaterialMesh(

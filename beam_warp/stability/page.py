@@ -91,7 +91,8 @@ if the run ends in anything but a reconstruction or a refusal where that is allo
   `new-surface` where a connected part of the subject is not covered, and `tracking-lost` where PSNR fell far or joints
   are torn apart, upon which the frame becomes a key frame.
 
-Without texture and at self-contact nothing is detected, and nothing need be: the scores say what they cost.
+Without texture or shading, on mirrors, at what is finer than a pixel and at self-contact nothing is detected, and
+nothing need be: the scores say what they cost.
 """
 
 

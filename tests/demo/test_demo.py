@@ -51,6 +51,12 @@ def test_figure_is_textured_within_what_materials_are(figure):
     assert mesh.roughness.std() > 0.02
 
 
+def test_figure_is_closed_where_its_surface_meets_the_grid():
+    """At this size a point of the grid lies on the surface: triangles about it have no area, and no normals."""
+    mesh = demo_figure_for(size=120).rest
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+
+
 def test_figure_is_concave(figure):
     mesh = trimesh.Trimesh(figure.rest.vertices, figure.rest.faces, process=False)
     assert mesh.volume < 0.4 * mesh.convex_hull.volume

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 
 from beam_warp.demo.figure import SKELETON
@@ -23,6 +24,7 @@ from beam_warp.stability.capture_cases.case import Detection, detections_of
 from beam_warp.stability.capture_cases.delivered import as_delivered, poses_off
 from beam_warp.stability.capture_cases.studio import StressStudio
 from beam_warp.stability.capture_cases.subjects import no_texture, object_appears, touching
+from beam_warp.stability.capture_cases.surfaces import pixel, rod
 
 CAMERA = "train_03"
 """The middle one of six."""
@@ -114,6 +116,25 @@ class TestDelivered:
     def test_a_case_can_be_made_twice(self, studio):
         first, second = (poses_off.build(studio).capture.records[0] for _ in range(2))
         np.testing.assert_array_equal(first.camera.camera_to_world, second.camera.camera_to_world)
+
+
+class TestFine:
+    """Meshes alone: what is traced of them is a matter of the path tracer."""
+
+    def test_rods_are_as_thick_as_they_say_and_end_where_they_say(self):
+        mesh = rod((0.0, 0.0, 1.0), (0.0, 2.0, 1.0), 0.01, (0.1, 0.2, 0.3))
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        octagon = 2.0 * np.sqrt(2.0) * 0.005**2
+        assert solid.is_watertight
+        assert solid.volume == pytest.approx(2.0 * octagon, rel=1e-3)
+        np.testing.assert_allclose(solid.bounds[:, 1], [0.0, 2.0], atol=1e-6)
+        assert np.all(np.einsum("fk,fk->f", mesh.normals[mesh.faces[:, 0]], solid.face_normals) > 0.999)
+
+    def test_a_pixel_is_that_of_the_cameras(self, tracing_studio):
+        camera = no_texture.build(tracing_studio).capture.records[0].camera
+        middle = tracing_studio.dancing()[0].vertices.mean(axis=0)
+        across = np.linalg.norm(camera.position - middle) / camera.focal_x
+        assert pixel(tracing_studio) == pytest.approx(across, rel=0.3)
 
 
 class TestTraced:

@@ -5,7 +5,7 @@ change them in memory. A case that shows another subject is path traced once, wh
 studio delivers it is a flawed copy, which `beam_warp.stability.flaws` writes.
 """
 
-from beam_warp.stability.capture_cases import cameras, delivered, subjects
+from beam_warp.stability.capture_cases import cameras, delivered, subjects, surfaces
 
 CAPTURE_CASES = [
     subjects.as_it_is,
@@ -13,6 +13,11 @@ CAPTURE_CASES = [
     subjects.every_third_frame,
     subjects.no_texture,
     subjects.self_contact,
+    surfaces.no_shading,
+    surfaces.mirror_like,
+    surfaces.thin_staff,
+    surfaces.hair,
+    surfaces.close_layers,
     cameras.black_camera,
     cameras.empty_camera,
     cameras.camera_without_files,
@@ -28,5 +33,14 @@ CAPTURE_CASES = [
 ]
 """Every case, in the order of the table; the first is the capture as it is."""
 
-TRACED_CASES = [subjects.no_texture, subjects.self_contact, subjects.object_appears]
+TRACED_CASES = [
+    subjects.no_texture,
+    subjects.self_contact,
+    surfaces.no_shading,
+    surfaces.mirror_like,
+    surfaces.thin_staff,
+    surfaces.hair,
+    surfaces.close_layers,
+    subjects.object_appears,
+]
 """Cases that show another subject than a given capture, and are path traced."""

@@ -10,6 +10,7 @@ from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, dome_cameras, write_capture
 from beam_warp.demo.figure import Figure
 from beam_warp.demo.lights import studio
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.mesh import MaterialMesh
 
 BRIEF_FRAMES = 2
@@ -61,8 +62,10 @@ class StressStudio:
         base = self.base()
         return replace(base, records=base.select(frames=base.frames[:BRIEF_FRAMES]))
 
-    def traced(self, name: str, make: Callable[[], Sequence[MaterialMesh]]) -> Capture:
-        """Return a capture of meshes, one a frame, path traced when first asked for."""
+    def traced(
+        self, name: str, make: Callable[[], Sequence[MaterialMesh]], light: EnvironmentMap | None = None
+    ) -> Capture:
+        """Return a capture of meshes, one a frame, path traced when first asked for; without a light, in the studio."""
         if name not in self._written:
             meshes = make()
             cameras = dome_cameras([mesh.vertices for mesh in meshes], self.camera_count, 2, self.size, self.size)
@@ -70,7 +73,7 @@ class StressStudio:
                 self.folder / name.replace(" ", "_"),
                 meshes,
                 cameras,
-                studio(),
+                light or studio(),
                 samples=self.samples,
                 device=self.device,
             )

@@ -62,17 +62,7 @@ def every_third_frame(at: StressStudio) -> CaptureStress:
 def no_texture(at: StressStudio) -> CaptureStress:
     """The figure in one grey."""
 
-    def plain() -> list[MaterialMesh]:
-        return [
-            replace(
-                mesh,
-                base_color=np.full_like(mesh.base_color, GREY),
-                roughness=np.full_like(mesh.roughness, GREY_ROUGHNESS),
-            )
-            for mesh in at.dancing()
-        ]
-
-    return CaptureStress(capture=at.traced("no texture", plain))
+    return CaptureStress(capture=at.traced("no texture", lambda: [plain(mesh) for mesh in at.dancing()]))
 
 
 @stability_case(
@@ -99,6 +89,13 @@ def object_appears(at: StressStudio) -> CaptureStress:
 
     return CaptureStress(
         capture=at.traced("an object appears", appearing), required=(Detection(NEW_SURFACE, frame=first),)
+    )
+
+
+def plain(mesh: MaterialMesh) -> MaterialMesh:
+    """Return a mesh in one grey."""
+    return replace(
+        mesh, base_color=np.full_like(mesh.base_color, GREY), roughness=np.full_like(mesh.roughness, GREY_ROUGHNESS)
     )
 
 
