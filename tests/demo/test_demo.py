@@ -52,7 +52,7 @@ def test_figure_is_textured_within_what_materials_are(figure):
 
 
 def test_figure_is_closed_where_its_surface_meets_the_grid():
-    """At this size a point of the grid lies on the surface: triangles about it have no area, and no normals."""
+    """A point of the grid lies on the surface at this size: triangles about it have no area, and no normals."""
     mesh = demo_figure_for(size=120).rest
     assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
 
