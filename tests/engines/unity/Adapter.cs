@@ -7,7 +7,7 @@ using Beam.Relightable;
 using UnityEngine;
 using UnityEngine.Rendering;
 
-/// <summary>Reads a camera, lights and the sphere of what casts shadows, a line each, and prints what shaders would get.</summary>
+/// <summary>Reads a camera, lights, a map and the sphere of what casts shadows, a line each, and prints what shaders would get.</summary>
 public static class Adapter {
     public static void Main() {
         var stage = new RelightableStage { shadowMapSize = 256, lampFactor = 1f };
@@ -24,6 +24,16 @@ public static class Adapter {
                 Print(found.GetColumn(0), found.GetColumn(1), found.GetColumn(2), found.GetColumn(3));
             }
             if (words[0] == "sphere") sphere = new Vector4(n[0], n[1], n[2], n[3]);
+            if (words[0] == "environment") {
+                int rows = (int)n[0];
+                Vector4[] texels = Enumerable.Range(0, 2 * rows * rows).Select(k => new Vector4(n[4 + 3 * k], n[5 + 3 * k], n[6 + 3 * k], 1f)).ToArray();
+                EnvironmentRegions regions = EnvironmentRegions.Cut(texels, rows, (int)n[1], (int)n[2]).Turned(n[3]);
+                var drawn = new ShadowMaps();
+                drawn.DrawRegions(new CommandBuffer(), stage, regions, sphere, 0.01f, 256, null);
+                Print(regions.Directions.Zip(regions.HalfAngles, (way, half) => new Vector4(way.x, way.y, way.z, half)).ToArray());
+                Print(regions.Moments.ToArray());
+                Print(Held(drawn, "rows"));
+            }
             if (words[0] != "light") continue;
             var place = new Transform { position = new Vector3(n[1], n[2], n[3]), forward = new Vector3(n[4], n[5], n[6]) };
             var light = new Light { type = (LightType)(int)n[0], transform = place, isActiveAndEnabled = true, shadows = LightShadows.Soft };

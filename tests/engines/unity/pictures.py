@@ -65,18 +65,20 @@ def set_view(device, camera, near=0.01, low_pass=0.3, antialiased=False):
     )
 
 
-def draw_buffer(device, cloud, camera, scene_depth=0.0):
+def draw_buffer(device, cloud, camera, scene_depth=0.0, regions=False):
     """Draw the G-buffer behind opaque surfaces whose depth is stored as that."""
     sort(device, len(cloud), camera.position, camera.forward)
     set_view(device, camera)
-    for name, kind in G_BUFFER.items():
+    targets = G_BUFFER | ({"_BeamArrived": "rgba16float"} if regions else {})
+    for name, kind in targets.items():
         device.target(name, 1, camera.height, camera.width, kind)
     device.texture("_CameraDepthTexture", np.full((1, camera.height, camera.width, 4), scene_depth))
-    device.draw("Splats.hlsl", ("SplatVertex", "SplatFragment"), list(G_BUFFER), 6 * len(cloud))
+    defines = ("BEAM_REGIONS",) if regions else ()
+    device.draw("Splats.hlsl", ("SplatVertex", "SplatFragment"), list(targets), 6 * len(cloud), defines=defines)
 
 
 def draw_shadow_maps(device, cloud, maps):
-    """Draw the shadow maps of all lamps."""
+    """Draw the shadow maps of all lamps, or of all regions of the environment."""
     for name in ("_BeamShadowSums", "_BeamShadowFirst"):
         device.target(name, max(len(maps.views), 1), MAP_SIZE, MAP_SIZE)
     device.texture("_BeamShadowMeshes", np.full((max(len(maps.views), 1), MAP_SIZE, MAP_SIZE, 4), 3e38))
@@ -122,13 +124,28 @@ def set_light(device, shot, maps):
     device.buffer("_BeamLamps", np.array(rows[1:] or rows, np.float32))
 
 
+def arrive(device, golden):
+    """Find what arrives of the environment at each Gaussian, by the maps of its regions."""
+    moments = golden.regions.moments.transpose(1, 0, 2)
+    device.buffer("_BeamRegions", moments.astype(np.float32))
+    count = len(golden.shot.cloud)
+    device.buffer("_BeamArrivals", np.zeros((count, 4), np.float32))
+    device.set(_BeamCounts=[count, len(moments), 0, 0])
+    device.compute("Arriving.hlsl", "Arrive", -(-count // 64))
+    device.held["_BeamArriving"] = device.held["_BeamArrivals"]
+
+
 def picture(device, golden, cloud=None, to_world=None):
     """Return radiance multiplied by alpha, and alpha, ``(H, W, 4)``; of another cloud, in axes that a matrix turns."""
     shot, maps = golden.shot, shadow_maps(golden)
     upload_gaussians(device, shot.cloud if cloud is None else cloud, to_world)
     draw_shadow_maps(device, shot.cloud, maps)
     set_light(device, shot, maps)
-    draw_buffer(device, shot.cloud, shot.camera)
+    regions = golden.regions is not None
+    if regions:
+        arrive(device, golden)
+    draw_buffer(device, shot.cloud, shot.camera, regions=regions)
     device.target("picture", 1, shot.camera.height, shot.camera.width)
-    device.draw("Deferred.hlsl", ("DeferredVertex", "DeferredFragment"), ["picture"], 3, blend="none")
+    entries, defines = ("DeferredVertex", "DeferredFragment"), ("BEAM_REGIONS",) if regions else ()
+    device.draw("Deferred.hlsl", entries, ["picture"], 3, blend="none", defines=defines)
     return device.image("picture")

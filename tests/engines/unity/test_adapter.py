@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from engines.unity.csharp import HERE, MONO, PACKAGE, compiled, needs_mono
 
+from beam_warp.light.regions import EnvironmentRegions
 from beam_warp.light.uploaded import upload_lights
-from beam_warp.render.shadow_maps import LARGEST_KERNEL, ShadowCasters, light_views
+from beam_warp.render.shadow_maps import LARGEST_KERNEL, ShadowCasters, distant_view, light_views
 from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
 
 pytestmark = [needs_mono, pytest.mark.slow]
@@ -110,10 +112,30 @@ def test_lamps_and_their_maps_are_those_of_the_renderer(adapter):
     np.testing.assert_allclose(lamps[3, 12:14], uploaded.cones.numpy()[3], rtol=1e-5)
     np.testing.assert_array_equal(lamps[:, 14], [len(each) for each in views])
     np.testing.assert_array_equal(lamps[:, 11], np.cumsum([0, *(len(each) for each in views[:-1])]))
-    every = [view for each in views for view in each]
-    for found, view in zip(rows.reshape(-1, 24), every, strict=True):
+    are_maps_of(rows, [view for each in views for view in each])
+
+
+def are_maps_of(rows, views):
+    for found, view in zip(rows.reshape(-1, 24), views, strict=True):
         camera, pose = view.camera, view.camera.camera_to_world
         lens = [camera.focal_x, camera.focal_y, camera.center_x, camera.center_y]
         axes = [*pose[:3, 0], view.front, *pose[:3, 1], CASTERS.thickness, *pose[:3, 2], LARGEST_KERNEL * 256]
         wanted = [*camera.position, view.radius, *axes, *lens, 256, 256, 0, 0]
         np.testing.assert_allclose(found, wanted, rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize(("count", "most"), [(16, 256), (4, 8)])
+def test_regions_of_environments_and_their_maps_are_those_of_the_renderer(adapter, count, most):
+    """Of a map that is black below, and one with more rows than are cut."""
+    radiance = np.random.default_rng(3).gamma(0.2, size=(16, 32, 3)).astype(np.float32)
+    radiance[10:] = 0.0
+    light = EnvironmentMap(radiance)
+    cut = light if most > 16 else light.resized(most, 2 * most)
+    wanted = EnvironmentRegions.of(cut, count).turned(40.0)
+    line = ("environment", 16, count, most, np.radians(40.0), radiance)
+    discs, moments, rows = adapter(("sphere", CASTERS.center, CASTERS.radius), line)[:3]
+    np.testing.assert_allclose(discs[:, :3], wanted.directions, atol=1e-6)
+    np.testing.assert_allclose(discs[:, 3], wanted.half_angles, atol=1e-5)
+    np.testing.assert_allclose(moments.reshape(-1, 3, 4).transpose(1, 0, 2), wanted.moments, rtol=1e-5, atol=1e-5)
+    pairs = zip(wanted.directions, wanted.half_angles, strict=True)
+    are_maps_of(rows, [distant_view(way, float(half), CASTERS, 256) for way, half in pairs])

@@ -85,4 +85,4 @@ def test_shaders_name_entries_that_are_there():
             entries = re.findall(r"#pragma (?:vertex|fragment|kernel) (\w+)", part)
             assert entries
             assert all(re.search(rf"\b{entry}\(", text) for entry in entries), (path.name, entries)
-    assert passes == 10
+    assert passes == 11

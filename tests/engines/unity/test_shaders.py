@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from engines.probes import PROBES, goldens
+from engines.probes import ENVIRONMENTS, PROBES, REGIONS, goldens
 from engines.unity.csharp import needs_mono, run
 from engines.unity.device import SHADERS, Device, compiled, needs_glslang
 from engines.unity.pictures import draw_buffer, picture, set_view, sort, upload_gaussians
@@ -24,6 +24,7 @@ ENTRIES = {
     "Evaluate.hlsl": ("Evaluate",),
     "Sort.hlsl": ("Keys", "Count", "Scan", "Scatter", "Order"),
     "Environment.hlsl": ("FromCube", "Irradiance"),
+    "Arriving.hlsl": ("Arrive",),
     "Splats.hlsl": ("SplatVertex", "SplatFragment"),
     "Meshes.hlsl": ("MeshVertex", "MeshFragment"),
     "Caster.hlsl": ("CasterVertex", "CasterFragment"),
@@ -36,7 +37,13 @@ VARIANTS = [
     *[("Splats.hlsl", entry, ("BEAM_SHADOW_MAP",)) for entry in ENTRIES["Splats.hlsl"]],
     *[("Splats.hlsl", entry, ("STEREO_INSTANCING_ON", "BEAM_DEPTH_ARRAY")) for entry in ENTRIES["Splats.hlsl"]],
     *[("Caster.hlsl", entry, ("BEAM_HDRP",)) for entry in ENTRIES["Caster.hlsl"]],
+    *[
+        ("Splats.hlsl", entry, (*others, "BEAM_REGIONS"))
+        for entry in ENTRIES["Splats.hlsl"]
+        for others in ((), ("STEREO_INSTANCING_ON", "BEAM_DEPTH_ARRAY"))
+    ],
     ("Deferred.hlsl", "DeferredFragment", ("BEAM_EXPOSED",)),
+    ("Deferred.hlsl", "DeferredFragment", ("BEAM_EXPOSED", "BEAM_REGIONS")),
     *[("Deferred.hlsl", entry, ("STEREO_INSTANCING_ON",)) for entry in ENTRIES["Deferred.hlsl"]],
 ]
 
@@ -54,7 +61,7 @@ def test_every_entry_compiles_and_validates():
 
 
 def test_every_hlsl_file_is_compiled():
-    included = {"Gaussians.hlsl", "Views.hlsl", "Stereo.hlsl", "Relight.hlsl"}
+    included = {"Gaussians.hlsl", "Views.hlsl", "Stereo.hlsl", "Relight.hlsl", "Light.hlsl"}
     assert {path.name for path in SHADERS.glob("*.hlsl")} == included | ENTRIES.keys()
 
 
@@ -138,6 +145,14 @@ def close_to(golden, found):
 def test_pictures_are_those_of_the_deferred_renderer(name):
     device = Device()
     for golden in goldens([name]):
+        assert close_to(golden, picture(device, golden)), golden.lighting
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBES)
+def test_regions_of_environments_cast_the_deferred_renderer_s_shadows(name):
+    device = Device()
+    for golden in goldens([name], ENVIRONMENTS, REGIONS):
         assert close_to(golden, picture(device, golden)), golden.lighting
 
 

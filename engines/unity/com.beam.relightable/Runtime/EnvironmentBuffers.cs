@@ -13,6 +13,9 @@ namespace Beam.Relightable {
         /// <summary>Of each: rows, and its first texel.</summary>
         public readonly Vector4[] Levels = new Vector4[LevelCount + 1];
 
+        private EnvironmentRegions regions;
+        private int cutInto;
+
         private EnvironmentBuffers(Func<int, int> rowsOf) {
             int end = 0;
             for (int level = 0; level <= LevelCount; level++) {
@@ -60,6 +63,15 @@ namespace Beam.Relightable {
             shader.SetVector("_BeamSource", found.Levels[6]); // 64 rows or fewer, hardly blurred for a cosine
             shader.Dispatch(irradiance, Groups(found.Levels[LevelCount].x), 1, 1);
             return found;
+        }
+
+        /// <summary>Return a number of regions of equal power. The first time waits for the graphics card.</summary>
+        public EnvironmentRegions Regions(int count) {
+            if (regions != null && cutInto == count) return regions;
+            var texels = new Vector4[(int)Levels[1].y];
+            Texels.GetData(texels, 0, 0, texels.Length);
+            cutInto = count;
+            return regions = EnvironmentRegions.Cut(texels, (int)Levels[0].x, count);
         }
 
         /// <summary>Release all memory.</summary>

@@ -10,12 +10,12 @@ namespace Beam.Relightable {
         /// <summary>Passes of Relight.shader.</summary>
         public const int SplatPass = 0, ShadowPass = 1, MeshPass = 2, LightPass = 3, DepthPass = 4;
         private const int AllSlices = -1;
-        private static readonly string[] Names = { "_BeamLook", "_BeamNormal", "_BeamRest", "_BeamFirst" };
+        private static readonly string[] Names = { "_BeamLook", "_BeamNormal", "_BeamRest", "_BeamFirst", "_BeamArrived" };
         private static readonly GraphicsFormat[] Formats = {
-            GraphicsFormat.R16G16B16A16_SFloat, GraphicsFormat.R16G16B16A16_SFloat, GraphicsFormat.R32G32B32A32_SFloat, GraphicsFormat.R32_SFloat,
+            GraphicsFormat.R16G16B16A16_SFloat, GraphicsFormat.R16G16B16A16_SFloat, GraphicsFormat.R32G32B32A32_SFloat, GraphicsFormat.R32_SFloat, GraphicsFormat.R16G16B16A16_SFloat,
         };
-        private readonly RenderTexture[] buffers = new RenderTexture[4];
-        private readonly RenderTargetIdentifier[] targets = new RenderTargetIdentifier[4];
+        private readonly RenderTexture[] buffers = new RenderTexture[5];
+        private RenderTargetIdentifier[] targets = new RenderTargetIdentifier[0];
         private readonly Material material = new Material(Resources.Load<Shader>("Beam/Relight"));
         private readonly bool isHighDefinition;
 
@@ -38,6 +38,7 @@ namespace Beam.Relightable {
             commands.SetGlobalBuffer("_BeamGaussians", take.Buffers.Gaussians);
             commands.SetGlobalBuffer("_BeamOrder", take.Buffers.Order);
             commands.SetGlobalMatrix("_BeamObject", take.ToWorld);
+            if (RelightableStage.Current.environmentShadows > 0) commands.SetGlobalBuffer("_BeamArriving", take.Buffers.Arriving);
             commands.DrawProcedural(Matrix4x4.identity, material, pass, MeshTopology.Triangles, 6 * take.Buffers.Count, 1);
         }
 
@@ -60,7 +61,8 @@ namespace Beam.Relightable {
             if (!stage.Bind(commands)) return;
             Pinhole first = EyeOf(camera, 0, eyes, size), second = EyeOf(camera, eyes - 1, eyes, size);
             CoreUtils.SetKeyword(material, "BEAM_DEPTH_ARRAY", isHighDefinition || eyes > 1);
-            Allocate(size, eyes);
+            CoreUtils.SetKeyword(material, "BEAM_REGIONS", stage.environmentShadows > 0);
+            Allocate(size, eyes, stage.environmentShadows > 0 ? 5 : 4);
             foreach (RelightableTake take in FarthestFirst(first)) {
                 take.Buffers.Sort(commands, take.ToWorld, 0.5f * (first.position + second.position), first.forward);
                 Pinhole.Set(commands, first, second, Mathf.Max(camera.nearClipPlane, 0.01f), take.asset.lowPass, take.asset.antialiased);
@@ -87,11 +89,12 @@ namespace Beam.Relightable {
             return Pinhole.Of(camera.GetStereoViewMatrix(which), camera.GetStereoNonJitteredProjectionMatrix(which), size);
         }
 
-        private void Allocate(Vector2Int size, int eyes) {
+        private void Allocate(Vector2Int size, int eyes, int count) {
             RenderTexture held = buffers[0];
-            if (held != null && held.width == size.x && held.height == size.y && held.volumeDepth == eyes) return;
-            for (int k = 0; k < buffers.Length; k++) {
-                if (buffers[k] != null) buffers[k].Release();
+            if (held != null && held.width == size.x && held.height == size.y && held.volumeDepth == eyes && targets.Length == count) return;
+            foreach (RenderTexture each in buffers) if (each != null) each.Release();
+            targets = new RenderTargetIdentifier[count];
+            for (int k = 0; k < count; k++) {
                 buffers[k] = Layers(size.x, size.y, eyes, Formats[k]);
                 targets[k] = buffers[k];
             }

@@ -27,6 +27,9 @@ namespace Beam.Relightable {
         /// <summary>Angle by which the environment is turned about the vertical [degree].</summary>
         public float rotation;
 
+        /// <summary>Regions of the environment that cast shadows, 4, 8, 16 or 32; 0: ambient occlusion stands for them.</summary>
+        public int environmentShadows;
+
         /// <summary>Exposure of takes [stops].</summary>
         public float exposure;
 
@@ -45,6 +48,7 @@ namespace Beam.Relightable {
         private EnvironmentBuffers environment;
         private GraphicsBuffer albedo;
         private ShadowMaps maps;
+        private EnvironmentShadows shadows;
         private Material material;
         private CommandBuffer commands;
 
@@ -84,6 +88,7 @@ namespace Beam.Relightable {
             albedo = new GraphicsBuffer(GraphicsBuffer.Target.Structured, 64 * 64, 16);
             albedo.SetData(Resources.Load<TextAsset>("Beam/Albedo").bytes);
             maps = new ShadowMaps();
+            shadows = new EnvironmentShadows();
             commands = new CommandBuffer { name = "Relightable shadow maps" };
             Refresh();
             RenderPipelineManager.beginContextRendering += Prepare;
@@ -93,6 +98,7 @@ namespace Beam.Relightable {
             RenderPipelineManager.beginContextRendering -= Prepare;
             if (Current == this) Current = null;
             maps.Dispose();
+            shadows.Dispose();
             albedo.Release();
             commands.Release();
             if (environment != null) environment.Dispose();
@@ -109,6 +115,7 @@ namespace Beam.Relightable {
             foreach (RelightableTake take in RelightableTake.Active)
                 if (take.IsReady) thickness = Mathf.Max(thickness, take.asset.thickness * take.transform.lossyScale.x);
             maps.Draw(commands, this, sphere, thickness, material);
+            if (environmentShadows > 0) shadows.Draw(commands, this, environment, sphere, thickness, material);
             context.ExecuteCommandBuffer(commands);
         }
 

@@ -5,7 +5,7 @@ using UnityEngine.Experimental.Rendering;
 using UnityEngine.Rendering;
 
 namespace Beam.Relightable {
-    /// <summary>Lamps of a stage as shaders read them, and their shadow maps of takes and chosen meshes.</summary>
+    /// <summary>Lamps of a stage as shaders read them, and shadow maps of takes and chosen meshes: theirs, or an environment's.</summary>
     /// <remarks>Where maps look from is that of beam_warp/render/shadow_maps.py.</remarks>
     public sealed class ShadowMaps : IDisposable {
         private const float Far = 500f, Room = 1.06f, Near = 0.02f, Widest = 60f, FaceAngle = 48f, LargestKernel = 0.25f, Thickest = 0.02f, LowPass = 0.1f;
@@ -21,14 +21,30 @@ namespace Beam.Relightable {
 
         /// <summary>Draw the maps of all lamps; what casts is in a sphere (centre, radius), its layers that thick [m].</summary>
         public void Draw(CommandBuffer commands, RelightableStage stage, Vector4 sphere, float thickness, Material material) {
-            lamps.Clear();
-            rows.Clear();
-            views.Clear();
+            Clear();
             foreach (RelightableStage.Lamp each in stage.Lit)
                 if (Lamps < MostMaps) Add(each, sphere, Mathf.Min(thickness, Thickest * sphere.w), stage);
             if (lamps.Count > 0) lampBuffer.SetData(lamps);
+            DrawViews(commands, stage, stage.shadowMapSize, material);
+        }
+
+        /// <summary>Draw the maps of an environment's regions.</summary>
+        public void DrawRegions(CommandBuffer commands, RelightableStage stage, EnvironmentRegions regions, Vector4 sphere, float thickness, int side, Material material) {
+            Clear();
+            for (int k = 0; k < regions.Directions.Count; k++)
+                AddDistant(-regions.Directions[k], regions.HalfAngles[k], sphere, Mathf.Min(thickness, Thickest * sphere.w), side);
+            DrawViews(commands, stage, side, material);
+        }
+
+        private void Clear() {
+            lamps.Clear();
+            rows.Clear();
+            views.Clear();
+        }
+
+        private void DrawViews(CommandBuffer commands, RelightableStage stage, int side, Material material) {
             if (rows.Count > 0) viewBuffer.SetData(rows);
-            Allocate(stage.shadowMapSize, Mathf.Max(views.Count, 1));
+            Allocate(side, Mathf.Max(views.Count, 1));
             RenderTargetIdentifier[] targets = { sums, nearest };
             for (int map = 0; map < views.Count; map++) {
                 commands.SetRenderTarget(targets, BuiltinRenderTextureType.None, 0, CubemapFace.Unknown, map);
@@ -56,6 +72,14 @@ namespace Beam.Relightable {
             commands.SetGlobalTexture("_BeamShadowMeshes", meshes);
         }
 
+        /// <summary>Let a compute shader read maps.</summary>
+        public void Bind(CommandBuffer commands, ComputeShader shader) {
+            commands.SetComputeBufferParam(shader, 0, "_BeamShadowViews", viewBuffer);
+            commands.SetComputeTextureParam(shader, 0, "_BeamShadowSums", sums);
+            commands.SetComputeTextureParam(shader, 0, "_BeamShadowFirst", nearest);
+            commands.SetComputeTextureParam(shader, 0, "_BeamShadowMeshes", meshes);
+        }
+
         /// <summary>Release all memory.</summary>
         public void Dispose() {
             lampBuffer.Release();
@@ -66,13 +90,13 @@ namespace Beam.Relightable {
         private void Add(RelightableStage.Lamp lamp, Vector4 sphere, float thickness, RelightableStage stage) {
             Light light = lamp.light;
             bool isDistant = light.type == LightType.Directional, isSpot = light.type == LightType.Spot;
-            Vector3 place = Axes.Swapped(light.transform.position), way = Axes.Swapped(light.transform.forward), center = sphere;
+            Vector3 place = Axes.Swapped(light.transform.position), way = Axes.Swapped(light.transform.forward);
             Color color = light.color.linear * light.intensity * stage.lampFactor;
             if (light.useColorTemperature) color *= Mathf.CorrelatedColorTemperatureToRGB(light.colorTemperature);
             float size = isDistant ? Mathf.Sin(0.5f * Mathf.Deg2Rad * lamp.size) : lamp.size;
             int first = views.Count;
             if (light.shadows != LightShadows.None && first + 6 <= MostMaps) {
-                if (isDistant) AddDistant(center - Far * sphere.w * way, way, lamp.size, sphere.w, thickness, stage.shadowMapSize);
+                if (isDistant) AddDistant(way, 0.5f * Mathf.Deg2Rad * lamp.size, sphere, thickness, stage.shadowMapSize);
                 else AddLamp(place, lamp.size, way, isSpot ? 0.5f * Mathf.Deg2Rad * light.spotAngle : Mathf.PI, sphere, thickness, stage.shadowMapSize);
             }
             float outer = Mathf.Cos(0.5f * Mathf.Deg2Rad * light.spotAngle);
@@ -83,9 +107,10 @@ namespace Beam.Relightable {
             lamps.Add(new Vector4(inner, outer, views.Count - first, 0f));
         }
 
-        private void AddDistant(Vector3 position, Vector3 way, float diameter, float radius, float thickness, int side) {
-            float distance = Far * radius, disc = distance * Mathf.Tan(0.5f * Mathf.Deg2Rad * diameter);
-            AddView(Pinhole.Looking(position, way, Mathf.Asin(Room / Far), side), disc, distance - Room * radius, thickness);
+        private void AddDistant(Vector3 way, float halfAngle, Vector4 sphere, float thickness, int side) {
+            float distance = Far * sphere.w;
+            Pinhole view = Pinhole.Looking((Vector3)sphere - distance * way, way, Mathf.Asin(Room / Far), side);
+            AddView(view, distance * Mathf.Tan(halfAngle), distance - Room * sphere.w, thickness);
         }
 
         private void AddLamp(Vector3 place, float radius, Vector3 way, float cone, Vector4 sphere, float thickness, int side) {

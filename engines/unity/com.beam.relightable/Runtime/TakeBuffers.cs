@@ -8,7 +8,7 @@ namespace Beam.Relightable {
         private const int RowsOfOne = 5, Run = 1024, Threads = 64;
         private readonly ComputeShader evaluate, sort;
         private readonly GraphicsBuffer components, first, second, digits;
-        private GraphicsBuffer still, segment, next, terms;
+        private GraphicsBuffer still, segment, next, terms, arriving;
         private Block segmentBlock, nextBlock;
 
         /// <summary>Number of Gaussians.</summary>
@@ -16,6 +16,9 @@ namespace Beam.Relightable {
 
         /// <summary>Rows of Gaussians, and their numbers, farthest first.</summary>
         public readonly GraphicsBuffer Gaussians, Order;
+
+        /// <summary>What arrives of an environment at each Gaussian, once it casts shadows.</summary>
+        public GraphicsBuffer Arriving => arriving = arriving ?? new GraphicsBuffer(GraphicsBuffer.Target.Structured, Mathf.Max(Count, 1), 16);
 
         /// <summary>Allocate for a number of Gaussians.</summary>
         public TakeBuffers(int count) {
@@ -95,7 +98,7 @@ namespace Beam.Relightable {
 
         /// <summary>Release all memory.</summary>
         public void Dispose() {
-            foreach (GraphicsBuffer each in new[] { Gaussians, Order, first, second, digits, components, still, segment, next, terms })
+            foreach (GraphicsBuffer each in new[] { Gaussians, Order, first, second, digits, components, still, segment, next, terms, arriving })
                 if (each != null) each.Release();
         }
 

@@ -171,6 +171,7 @@ namespace UnityEngine {
         public void SetData(Array data) { }
         public void SetData(Array data, int from, int to, int count) { }
         public void SetData<T>(List<T> data) where T : struct { }
+        public void GetData(Array data, int to, int from, int count) { }
         public void Release() { }
     }
     public class Renderer : Component { public bool enabled; public Material[] sharedMaterials; }
@@ -244,6 +245,8 @@ namespace UnityEngine.Rendering {
         public void SetGlobalMatrixArray(string name, Matrix4x4[] values) { }
         public void SetComputeBufferParam(ComputeShader shader, int kernel, string name, GraphicsBuffer buffer) { }
         public void SetComputeVectorParam(ComputeShader shader, string name, Vector4 value) { }
+        public void SetComputeVectorArrayParam(ComputeShader shader, string name, Vector4[] values) { }
+        public void SetComputeTextureParam(ComputeShader shader, int kernel, string name, RenderTargetIdentifier value) { }
         public void SetComputeMatrixParam(ComputeShader shader, string name, Matrix4x4 value) { }
         public void DispatchCompute(ComputeShader shader, int kernel, int x, int y, int z) { }
         public void SetRenderTarget(RenderTargetIdentifier color, RenderTargetIdentifier depth, int mip, CubemapFace face, int slice) { }

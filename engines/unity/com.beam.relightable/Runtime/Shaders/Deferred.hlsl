@@ -7,73 +7,20 @@ Texture2DArray<float4> _BeamLook;
 Texture2DArray<float4> _BeamNormal;
 Texture2DArray<float4> _BeamRest;
 Texture2DArray<float4> _BeamFirst;
-Texture2DArray<float4> _BeamShadowSums; // of Gaussians: depth times alpha, alpha in z and w
-Texture2DArray<float4> _BeamShadowFirst; // depth of the nearest splat that hides a quarter [m], 0 for none
-Texture2DArray<float4> _BeamShadowMeshes; // depth of triangles [m]; where there are none, a great one
-StructuredBuffer<float4> _BeamEnvironment; // texels of all levels, and irradiance
-StructuredBuffer<float4> _BeamAlbedo; // (A, B), 64 x 64
+#if defined(BEAM_REGIONS)
+Texture2DArray<float4> _BeamArrived; // of the environment, shadows of its regions taken into account
+#endif
 StructuredBuffer<float4> _BeamLamps; // four rows a lamp
-StructuredBuffer<float4> _BeamShadowViews; // six rows a map
-float4 _BeamLevels[14]; // rows, and first texel; the last is the irradiance
-float4 _BeamTurn; // cosine and sine of the environment's angle about z; number of lamps; exposure, a factor
 
 #if defined(BEAM_EXPOSED)
 Texture2D<float4> _ExposureTexture; // HDRP's: colours are multiplied by what it holds
 #endif
 
-#define RELIGHT_FETCHING
-#include "Relight.hlsl"
-
-int environmentRows(int level)
-{
-    return int(_BeamLevels[level < 0 ? 13 : level].x);
-}
-
-float3 environmentTexel(int level, int2 cell)
-{
-    float4 place = _BeamLevels[level < 0 ? 13 : level];
-    return _BeamEnvironment[int(place.y) + cell.y * 2 * int(place.x) + cell.x].xyz;
-}
-
-float2 albedoTexel(int2 cell)
-{
-    return _BeamAlbedo[cell.y * 64 + cell.x].xy;
-}
-
-ShadowView shadowView(int map)
-{
-    ShadowView view;
-    float4 place = _BeamShadowViews[6 * map];
-    float4 right = _BeamShadowViews[6 * map + 1];
-    float4 down = _BeamShadowViews[6 * map + 2];
-    float4 forward = _BeamShadowViews[6 * map + 3];
-    float4 lens = _BeamShadowViews[6 * map + 4];
-    view.position = place.xyz;
-    view.radius = place.w;
-    view.right = right.xyz;
-    view.front = right.w;
-    view.down = down.xyz;
-    view.thickness = down.w;
-    view.forward = forward.xyz;
-    view.largestKernel = forward.w;
-    view.focal = lens.xy;
-    view.center = lens.zw;
-    view.size = _BeamShadowViews[6 * map + 5].xy;
-    return view;
-}
-
-float4 shadowTexel(int map, int2 cell)
-{
-    float4 sums = _BeamShadowSums.Load(int4(cell, map, 0));
-    float mesh = _BeamShadowMeshes.Load(int4(cell, map, 0)).x;
-    float mean = sums.w > 0.0 ? sums.z / sums.w : 0.0;
-    float first = _BeamShadowFirst.Load(int4(cell, map, 0)).x;
-    return float4(min(sums.w, 1.0), first > 0.0 ? first : mean, mean, mesh);
-}
+#include "Light.hlsl"
 
 int regionCount()
 {
-    return 0; // ambient occlusion stands for the environment's shadows
+    return 0; // Arriving.hlsl reads their maps
 }
 
 Region regionAt(int k)
@@ -134,7 +81,12 @@ float4 DeferredFragment(WholeScreen input) : SV_Target0
     float first = _BeamFirst.Load(int4(pixel, input.eye, 0)).x;
     float depth = first > 0.0 ? min(rest.z / rest.w, first) : rest.z / rest.w;
     Surface surface = surfaceOfSums(look.xyz * (rest.w / max(look.w, 1.0e-6)), rest.x, rest.y, normal.xyz, rest.w, view.position, ray, depth);
+#if defined(BEAM_REGIONS)
+    float4 arrived = _BeamArrived.Load(int4(pixel, input.eye, 0));
+    float3 radiance = shadowedRadiance(surface, arrived.xyz / max(arrived.w, 1.0e-6), _BeamTurn.xy);
+#else
     float3 radiance = environmentRadiance(surface, _BeamTurn.xy);
+#endif
     float2 turn = randomTurn(uint(pixel.y) * uint(_BeamTarget.x) + uint(pixel.x));
     for (int k = 0; k < int(_BeamTurn.z); k++)
         radiance += lampRadiance(surface, lampAt(k), turn);

@@ -4,6 +4,9 @@
 #include "Stereo.hlsl"
 
 StructuredBuffer<uint> _BeamOrder; // farthest first
+#if defined(BEAM_REGIONS)
+StructuredBuffer<float4> _BeamArriving; // what Arriving.hlsl found
+#endif
 
 #if defined(BEAM_DEPTH_ARRAY)
 Texture2DArray<float4> _CameraDepthTexture;
@@ -22,8 +25,11 @@ struct SplatCorner
     nointerpolation float4 shape : TEXCOORD1; // and reach
     nointerpolation float4 plane : TEXCOORD2; // slope, depth, logOpacity
     nointerpolation float4 look : TEXCOORD3; // base colour, roughness
-    nointerpolation float4 normal : TEXCOORD4; // and ambient occlusion
+    nointerpolation float4 normal : TEXCOORD4; // and ambient occlusion, or the share of the environment that arrives
     nointerpolation uint eye : TEXCOORD5;
+#if defined(BEAM_REGIONS)
+    nointerpolation float3 arriving : TEXCOORD6;
+#endif
     BEAM_EYE_OUTPUT
 };
 
@@ -33,6 +39,9 @@ struct Sums
     float4 normal : SV_Target1; // normal, alpha
     float4 rest : SV_Target2; // roughness, ambient occlusion, depth, alpha
     float4 first : SV_Target3; // depth of the nearest splat of HIDING: blended as if it hid all
+#if defined(BEAM_REGIONS)
+    float4 arriving : SV_Target4; // irradiance of the environment, alpha
+#endif
 };
 
 SplatCorner SplatVertex(uint vertex : SV_VertexID BEAM_EYE_INPUT)
@@ -40,7 +49,8 @@ SplatCorner SplatVertex(uint vertex : SV_VertexID BEAM_EYE_INPUT)
     uint eye = BEAM_EYE;
     uint corner = vertex % 6u;
     float2 side = float2(corner == 1u || corner == 2u || corner == 4u ? 1.0 : -1.0, corner == 2u || corner == 4u || corner == 5u ? 1.0 : -1.0);
-    Gaussian g = gaussianAt(_BeamOrder[vertex / 6u]);
+    uint index = _BeamOrder[vertex / 6u];
+    Gaussian g = gaussianAt(index);
     Splat splat = project(g, eyeView(eye), _BeamTarget.w, _BeamFilter.x, _BeamFilter.y > 0.5);
     SplatCorner output = (SplatCorner)0;
     output.offset = cornerOf(splat, side);
@@ -49,6 +59,11 @@ SplatCorner SplatVertex(uint vertex : SV_VertexID BEAM_EYE_INPUT)
     output.plane = float4(splat.slope, splat.depth, splat.logOpacity);
     output.look = float4(g.baseColor, g.roughness);
     output.normal = float4(g.normal, g.ambientOcclusion);
+#if defined(BEAM_REGIONS)
+    float4 arriving = _BeamArriving[index];
+    output.arriving = arriving.xyz;
+    output.normal.w = arriving.w;
+#endif
     output.eye = eye;
     BEAM_SET_EYE(output, eye)
     return output;
@@ -109,6 +124,9 @@ Sums SplatFragment(SplatCorner input)
     float hides = alpha >= HIDING ? 1.0 : 0.0;
     sums.first = float4(depth * hides, 0.0, 0.0, hides);
     sums.rest = float4(input.look.w * alpha, input.normal.w * alpha, depth * alpha, alpha);
+#if defined(BEAM_REGIONS)
+    sums.arriving = float4(input.arriving * alpha, alpha);
+#endif
     return sums;
 }
 #endif

@@ -16,6 +16,7 @@ Shader "Hidden/Beam/Relight"
             #pragma vertex SplatVertex
             #pragma fragment SplatFragment
             #pragma multi_compile_local _ BEAM_DEPTH_ARRAY
+            #pragma multi_compile_local _ BEAM_REGIONS
             #include "../../Shaders/Splats.hlsl"
             ENDHLSL
         }
@@ -55,6 +56,7 @@ Shader "Hidden/Beam/Relight"
             #pragma vertex DeferredVertex
             #pragma fragment DeferredFragment
             #pragma multi_compile_local _ BEAM_EXPOSED
+            #pragma multi_compile_local _ BEAM_REGIONS
             #include "../../Shaders/Deferred.hlsl"
             ENDHLSL
         }

@@ -1,0 +1,132 @@
+using System;
+using System.Collections.Generic;
+using UnityEngine;
+
+namespace Beam.Relightable {
+    /// <summary>Regions of an environment of equal power, in the renderer's world; each casts shadows from where its power is.</summary>
+    /// <remarks>They are those of beam_warp/light/regions.py.</remarks>
+    public sealed class EnvironmentRegions {
+        private const double Widest = 75.0 * Math.PI / 180.0;
+
+        /// <summary>Unit vectors towards their light.</summary>
+        public readonly List<Vector3> Directions = new List<Vector3>();
+
+        /// <summary>Half angles of their discs [rad].</summary>
+        public readonly List<float> HalfAngles = new List<float>();
+
+        /// <summary>Three rows each, of red, green and blue: radiance times direction, summed, and how wide it spreads.</summary>
+        public readonly List<Vector4> Moments = new List<Vector4>();
+
+        /// <summary>Cut a lat-long map, its top row first, into a number of regions, or the next power of two.</summary>
+        public static EnvironmentRegions Cut(Vector4[] texels, int rows, int count, int mostRows = 256) {
+            var map = new Map(texels, rows, Math.Min(rows, mostRows));
+            var boxes = new List<Box> { new Box(0, map.Rows, 0, 2 * map.Rows) };
+            while (boxes.Count < count) {
+                var halves = new List<Box>();
+                foreach (Box box in boxes) halves.AddRange(map.Halves(box));
+                boxes = halves;
+            }
+            var found = new EnvironmentRegions();
+            foreach (Box box in boxes) map.Sum(box, found);
+            return found;
+        }
+
+        /// <summary>Return the regions of the environment turned about the vertical [rad].</summary>
+        public EnvironmentRegions Turned(float angle) {
+            var found = new EnvironmentRegions();
+            float c = Mathf.Cos(angle), s = Mathf.Sin(angle);
+            foreach (Vector3 each in Directions) found.Directions.Add(new Vector3(c * each.x - s * each.y, s * each.x + c * each.y, each.z));
+            foreach (Vector4 each in Moments) found.Moments.Add(new Vector4(c * each.x - s * each.y, s * each.x + c * each.y, each.z, each.w));
+            found.HalfAngles.AddRange(HalfAngles);
+            return found;
+        }
+
+        private struct Box {
+            public readonly int Top, Bottom, Left, Right;
+
+            public Box(int top, int bottom, int left, int right) {
+                Top = top;
+                Bottom = bottom;
+                Left = left;
+                Right = right;
+            }
+        }
+
+        private sealed class Map {
+            public readonly int Rows;
+            private readonly double[] flux, power;
+
+            /// <summary>Sum what texels shed into cells of as many rows or fewer.</summary>
+            public Map(Vector4[] texels, int texelRows, int rows) {
+                Rows = rows;
+                flux = new double[6 * rows * rows];
+                power = new double[2 * rows * rows];
+                for (int y = 0; y < texelRows; y++)
+                    for (int x = 0; x < 2 * texelRows; x++) {
+                        Vector4 texel = texels[2 * texelRows * y + x];
+                        int cell = 2 * rows * (int)((long)y * rows / texelRows) + (int)((long)x * rows / texelRows);
+                        double angle = AngleOf(y, texelRows);
+                        flux[3 * cell] += angle * texel.x;
+                        flux[3 * cell + 1] += angle * texel.y;
+                        flux[3 * cell + 2] += angle * texel.z;
+                        power[cell] += angle * (0.2126 * texel.x + 0.7152 * texel.y + 0.0722 * texel.z);
+                    }
+                if (Array.Exists(power, each => each > 0.0)) return;
+                for (int cell = 0; cell < power.Length; cell++) power[cell] = AngleOf(cell / (2 * rows), rows); // a black one is cut evenly
+            }
+
+            /// <summary>Cut a box where half of its power is on either side; one of a single cell stays, beside an empty one.</summary>
+            public Box[] Halves(Box box) {
+                int tall = box.Bottom - box.Top, wide = box.Right - box.Left;
+                bool isAcross = wide * Math.Sin(Math.PI * 0.5 * (box.Top + box.Bottom) / Rows) > tall;
+                if ((isAcross ? wide : tall) < 2) isAcross = wide > tall;
+                var sums = new double[isAcross ? wide : tall];
+                if (sums.Length < 2) return new[] { box, new Box(box.Bottom, box.Bottom, box.Left, box.Right) };
+                for (int y = box.Top; y < box.Bottom; y++)
+                    for (int x = box.Left; x < box.Right; x++) sums[isAcross ? x - box.Left : y - box.Top] += power[2 * Rows * y + x];
+                for (int k = 1; k < sums.Length; k++) sums[k] += sums[k - 1];
+                double half = 0.5 * sums[sums.Length - 1];
+                int cut = 0;
+                for (int k = 1; k < sums.Length - 1; k++) if (Math.Abs(sums[k] - half) < Math.Abs(sums[cut] - half)) cut = k;
+                int column = box.Left + cut + 1, row = box.Top + cut + 1;
+                return isAcross
+                    ? new[] { new Box(box.Top, box.Bottom, box.Left, column), new Box(box.Top, box.Bottom, column, box.Right) }
+                    : new[] { new Box(box.Top, row, box.Left, box.Right), new Box(row, box.Bottom, box.Left, box.Right) };
+            }
+
+            /// <summary>Add a box to regions; an empty one sheds no light from above.</summary>
+            public void Sum(Box box, EnvironmentRegions into) {
+                double total = 0.0, lit = 0.0;
+                double[] mean = new double[3], even = new double[3], fluxes = new double[3], sums = new double[9];
+                for (int y = box.Top; y < box.Bottom; y++)
+                    for (int x = box.Left; x < box.Right; x++) {
+                        int cell = 2 * Rows * y + x;
+                        double theta = (y + 0.5) * Math.PI / Rows, phi = Math.PI - (x + 0.5) * Math.PI / Rows;
+                        double[] way = { Math.Sin(theta) * Math.Cos(phi), Math.Sin(theta) * Math.Sin(phi), Math.Cos(theta) };
+                        total += 1.0;
+                        lit += power[cell];
+                        for (int k = 0; k < 3; k++) {
+                            mean[k] += power[cell] * way[k];
+                            even[k] += way[k];
+                            fluxes[k] += flux[3 * cell + k];
+                            for (int c = 0; c < 3; c++) sums[3 * c + k] += flux[3 * cell + c] * way[k];
+                        }
+                    }
+                if (!(lit > 0.0)) mean = even;
+                else total = lit;
+                double length = Length(mean, 0), cosine = total > 0.0 ? length / total : 1.0;
+                bool isSomewhere = length > 1e-9 * Math.Max(total, 1e-300);
+                into.Directions.Add(isSomewhere ? new Vector3((float)(mean[0] / length), (float)(mean[1] / length), (float)(mean[2] / length)) : new Vector3(0f, 0f, 1f));
+                into.HalfAngles.Add((float)Math.Acos(Math.Min(Math.Max(2.0 * cosine - 1.0, Math.Cos(Widest)), 1.0)));
+                for (int c = 0; c < 3; c++) {
+                    double size = Length(sums, 3 * c), spread = Math.Max(1.0 - size / Math.Max(fluxes[c], 1e-300), 0.0);
+                    into.Moments.Add(new Vector4((float)sums[3 * c], (float)sums[3 * c + 1], (float)sums[3 * c + 2], (float)(size * Math.Sqrt(3.0 * spread))));
+                }
+            }
+
+            private static double AngleOf(int row, int rows) => Math.PI / rows * (Math.Cos(Math.PI * row / rows) - Math.Cos(Math.PI * (row + 1) / rows));
+
+            private static double Length(double[] v, int at) => Math.Sqrt(v[at] * v[at] + v[at + 1] * v[at + 1] + v[at + 2] * v[at + 2]);
+        }
+    }
+}
