@@ -14,6 +14,7 @@ import {enterVr, hasVr} from "./vr.js";
 
 const CHANNELS = {relit: "lit", base_color: "base colour", roughness: "roughness", ambient_occlusion: "ambient occlusion",
   normals: "normals", depth: "depth", alpha: "alpha", radiance: "captured colour"};
+const SHADOW_REGIONS = {0: "by ambient occlusion", 8: "by 8 maps", 16: "by 16 maps", 32: "by 32 maps"};
 const TRANSFORMS = ["standard", "aces", "agx", "neutral"];
 const NONE = "none", SCALES = [1, 0.75, 0.5, 0.35, 0.25], SHADOWS = [1024, 1024, 512, 256, 256], SLOW = 80, FAST = 24, STILL = 200;
 const ASK_FOR_FILE = "Choose the .b4d file here, or serve the folder: python3 -m http.server";
@@ -46,8 +47,8 @@ export class Player {
   constructor(root, settings) {
     const {view = {}} = settings;
     Object.assign(this, {root, settings, shadows: SHADOWS, scale: 0, lastMove: 0, environments: new Map()});
-    this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: null, rotation: 0, exposure: 0, behind: false,
-      transform: "standard", background: "#212121", path: Boolean(view.cameras), ...view.state};
+    this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: null, environmentShadows: 0, rotation: 0,
+      exposure: 0, behind: false, transform: "standard", background: "#212121", path: Boolean(view.cameras), ...view.state};
     this.canvas = element("canvas", {tabIndex: 0, ariaLabel: "The take. Drag or use the arrow keys to orbit."});
     this.overlay = document.createElementNS("http://www.w3.org/2000/svg", "svg");
     this.overlay.classList.add("handles");
@@ -140,7 +141,7 @@ export class Player {
     if ("time" in values || "playing" in values) this.showTime();
     if ("background" in values) this.root.style.setProperty("--behind", state.background);
     if (relight) Object.assign(relight, {rotation: this.rotation, exposure: state.exposure, viewTransform: state.transform,
-      channel: state.channel, background: state.behind ? "environment" : null});
+      environmentShadows: state.environmentShadows, channel: state.channel, background: state.behind ? "environment" : null});
     this.wake();
   }
 
@@ -344,8 +345,8 @@ export class Player {
       group("Picture", true, this.channel = this.select("Channel", "channel", CHANNELS), this.color("Background", "background"),
         this.settings.view?.cameras ? this.check("Camera path", "path") : "",
         element("button", {className: "word", textContent: "Frame subject", onclick: () => this.frameSubject()})),
-      group("Light", true, this.environmentSelect(), this.check("Show it behind", "behind"), this.range("Rotation", "rotation", -180, 180, 1, "°"),
-        this.range("Exposure", "exposure", -6, 6, 0.1, " stops"), this.select("View transform", "transform", TRANSFORMS)),
+      group("Light", true, this.environmentSelect(), this.check("Show it behind", "behind"), this.select("Its shadows", "environmentShadows", SHADOW_REGIONS),
+        this.range("Rotation", "rotation", -180, 180, 1, "°"), this.range("Exposure", "exposure", -6, 6, 0.1, " stops"), this.select("View transform", "transform", TRANSFORMS)),
       group("Lamps", true, element("div", {className: "row"}, kind, add), this.lamps.list),
       this.stillGroup = this.stills ? group("Stills", false, ...this.stills.controls) : "",
       group("Files", false, element("div", {className: "row"}, element("button", {className: "word", textContent: "Save PNG", onclick: () => this.savePng()}),
@@ -357,7 +358,8 @@ export class Player {
 
   select(label, name, choices) {
     const pairs = Array.isArray(choices) ? choices.map((each) => [each, each]) : Object.entries(choices);
-    const made = element("select", {onchange: () => this.change({[name]: made.value})},
+    const isNumber = typeof this.state[name] === "number";
+    const made = element("select", {onchange: () => this.change({[name]: isNumber ? Number(made.value) : made.value})},
       ...pairs.map(([value, textContent]) => element("option", {value, textContent})));
     made.value = this.state[name];
     this.shown[name] = (value) => { made.value = value; };

@@ -32,8 +32,8 @@ async function coreFor(player) {
   if (player.relight.backend === "webgl2") return player;
   const canvas = document.createElement("canvas"), relight = await Relight.create(canvas, {backend: "webgl2"});
   await relight.open(player.take);
-  const {environment, rotation, exposure, viewTransform, lights, channel} = player.relight;
-  return {relight: Object.assign(relight, {environment, rotation, exposure, viewTransform, lights, channel}), canvas};
+  const {environment, environmentShadows, rotation, exposure, viewTransform, lights, channel} = player.relight;
+  return {relight: Object.assign(relight, {environment, environmentShadows, rotation, exposure, viewTransform, lights, channel}), canvas};
 }
 
 class Headset {

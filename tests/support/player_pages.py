@@ -59,8 +59,8 @@ def camera_of(page, scale=1.0):
     return Camera(int(given["width"]), int(given["height"]), *given["focal"], *given["center"], pose)
 
 
-def as_rendered(page, cloud, environment):
+def as_rendered(page, cloud, environment, options=UNSHADOWED):
     """What the deferred renderer shows of a cloud to the page's camera, and where it is covered."""
     shot = Shot(cloud=cloud, camera=camera_of(page), environment=environment)
-    image = DeferredRenderer(UNSHADOWED, device="cpu").draw(shot)
+    image = DeferredRenderer(options, device="cpu").draw(shot)
     return display_over(image.rgb, image.alpha, background=BACKGROUND), image.alpha

@@ -9,6 +9,7 @@ from io import BytesIO
 import npm_packages
 import numpy as np
 import pytest
+from engines.probes import PROBES, REGIONS
 from PIL import Image
 from support.drawn_ball import drawn_ball
 from support.player_pages import HEIGHT, WIDTH, as_rendered, picture, ready, said, settled, until
@@ -161,6 +162,22 @@ def test_controls_change_the_picture(page):
     assert dark[dark.shape[0] // 2 - 30, int(0.5 * page.evaluate("player.free().width"))].max() < 8
     page.get_by_label("Background").fill("#00ff00")
     assert picture(page)[5, 5].tolist() == [0, 255, 0]
+
+
+def test_an_environment_s_shadows_are_drawn_if_they_are_asked_for(opened, light, tmp_path):
+    cloud = PROBES["corner"]()
+    converters.write(GaussianSequence.from_clouds([cloud]), tmp_path / "corner.b4d")
+    path = tmp_path / "page.html"
+    assert main([str(tmp_path / "corner.b4d"), str(path), "--player", "--quiet", "--environment", str(light)]) == 0
+    page = ready(opened(path))
+    bare = picture(page)
+    page.get_by_label("Its shadows").select_option("by 16 maps")
+    shadowed = picture(page)
+    expected, alpha = as_rendered(page, cloud, EnvironmentMap.read(light), REGIONS)
+    assert psnr(shadowed / 255.0, expected / 255.0, alpha > 0.99) > 38.0
+    assert psnr(bare / 255.0, expected / 255.0, alpha > 0.99) < 30.0
+    page.get_by_label("Its shadows").select_option("by ambient occlusion")
+    np.testing.assert_array_equal(picture(page), bare)
 
 
 def test_a_mouse_orbits_and_a_wheel_comes_nearer(page):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engines.probes import LAMPS, MAP_SIZE, PROBES, REGIONS, ROTATION, SIDE, goldens
+from engines.probes import ENVIRONMENTS, LAMPS, MAP_SIZE, PROBES, REGIONS, ROTATION, SIDE, goldens
 from engines.web.pages import BACKENDS, camera_record, chromium, numbers, open_page
 from web.viewers import CHROMIUM
 
@@ -57,7 +57,7 @@ def test_a_probe_looks_as_the_deferred_renderer_draws_it_on_both_backends(name, 
 
 @pytest.mark.parametrize("name", list(PROBES))
 def test_regions_of_an_environment_cast_the_deferred_renderer_s_shadows(name, stands, tmp_path):
-    for golden in goldens([name], ["sunset"], REGIONS):
+    for golden in goldens([name], ENVIRONMENTS, REGIONS):
         check(golden, stands, tmp_path, environment_shadows=len(golden.regions))
 
 
