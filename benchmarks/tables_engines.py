@@ -13,10 +13,11 @@ BACKENDS = {"webgl2": "WebGL 2", "webgpu": "WebGPU"}
 
 @table("engine_shading", ENGINES)
 def shading(result: Row) -> Rows:
-    """Return PSNR by probe, lighting and language."""
-    rows: list[list[Any]] = [["probe", "light", "WGSL [dB]", "HLSL [dB]", "GLSL ES [dB]"]]
+    """Return PSNR by probe, lighting, and language or engine."""
+    targets = {"wgsl": "WGSL", "hlsl": "HLSL", "glsl": "GLSL ES", "unity": "Unity's entries", **BACKENDS}
+    rows: list[list[Any]] = [["probe", "light", *(f"{name} [dB]" for name in targets.values())]]
     for row in result["rows"]:
-        values = [cell(row["psnr"].get(target), ".0f") for target in ("wgsl", "hlsl", "glsl")]
+        values = [cell(row["psnr"].get(target), ".0f") for target in targets]
         rows.append([row["probe"], row["lighting"], *values])
     return rows
 

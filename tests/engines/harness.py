@@ -13,13 +13,14 @@ import sys
 from base64 import b64decode
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from engines.probes import Golden, Maps, prefiltered, shadow_maps
+from engines.probes import SIDE, Golden, Maps, prefiltered, shadow_maps
 from numpy.typing import NDArray
 from web.viewers import CHROMIUM, HERE, chromium
 
@@ -205,6 +206,21 @@ def program(target: str, function: str, folder: Path) -> Iterator[Program]:
             return np.frombuffer(b64decode(text), np.float32).reshape(-1, 4)[:count]
 
         yield run_on
+
+
+def shaded(target: str, cases: Sequence[Golden], folder: Path) -> list[FloatArray]:
+    """Return the pixels of cases; with regions, what arrives at Gaussians is found and blended first."""
+    cases, shadowed = list(cases), [k for k, golden in enumerate(cases) if golden.regions]
+    if shadowed:
+        with program(target, "arrivedAt", folder) as lit:
+            for k in shadowed:
+                values = cases[k].frame.gaussians.values
+                rows = values.numpy().copy()
+                rows[:, 8:] = lit(packed(cases[k]), len(rows))
+                values.assign(rows)
+                cases[k] = replace(cases[k])  # without the buffer of what the renderer found to arrive
+    with program(target, "shadedPixel", folder) as made:
+        return [made(packed(golden), SIDE * SIDE) for golden in cases]
 
 
 def packed(golden: Golden) -> FloatArray:

@@ -1,12 +1,11 @@
 """The shading source of engines: its constants, its generated texts, its functions in float64, and whole pictures."""
 
 import re
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from engines.harness import generate, missing, packed, program, psnr
+from engines.harness import generate, missing, packed, program, psnr, shaded
 from engines.probes import ENVIRONMENTS, PROBES, REGIONS, SIDE, TAPS, goldens
 
 from beam_warp.image.color import linear_to_srgb
@@ -169,16 +168,10 @@ def test_regions_of_environments_cast_the_deferred_renderer_s_shadows(name, targ
     lacking = missing(target)
     if lacking:
         pytest.skip(lacking)
-    found, every = {}, list(goldens([name], ENVIRONMENTS, REGIONS))
-    with program(target, "arrivedAt", tmp_path) as lit:
-        arrived = [lit(packed(golden), len(golden.shot.cloud)) for golden in every]
-    with program(target, "shadedPixel", tmp_path) as shaded:
-        for golden, light in zip(every, arrived, strict=True):
-            values = golden.frame.gaussians.values
-            rows = values.numpy()
-            rows[:, 8:] = light
-            values.assign(rows)
-            drawn = packed(replace(golden))  # without the buffer of what the renderer found to arrive
-            found[golden.lighting] = psnr(shaded(drawn, SIDE * SIDE), golden)
-            assert np.abs(light[:, 3] - golden.shot.cloud.ambient_occlusion).max() > 0.05, golden.lighting
+    every = list(goldens([name], ENVIRONMENTS, REGIONS))
+    pictures = shaded(target, every, tmp_path)
+    found = {golden.lighting: psnr(made, golden) for golden, made in zip(every, pictures, strict=True)}
+    for golden in every:
+        share = golden.frame.gaussians.values.numpy()[:, 11]
+        assert np.abs(share - golden.shot.cloud.ambient_occlusion).max() > 0.05, golden.lighting
     assert min(found.values()) > 40.0, found

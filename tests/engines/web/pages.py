@@ -13,10 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from engines.probes import LAMPS, MAP_SIZE, ROTATION, SIDE, Golden
 from numpy.typing import NDArray
 from web.viewers import CHROMIUM, HERE
 
+from beam_warp.converters import WriteOptions, write
 from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianSequence
+from beam_warp.world.lights import lights_to_json
 
 MODULE = Path(__file__).parents[3] / "engines" / "web"
 FLAGS = (
@@ -57,6 +61,25 @@ window.packed = (numbers) => {
 };
 window.isThere = true;
 </script>"""
+
+
+SHOW = """async ([probe, lighting, rows, camera, lights, rotation, environmentShadows]) => {
+  window.environments ??= new Map();
+  if (!environments.has(lighting)) {
+    const radiance = new Float32Array(await (await fetch(`/${lighting}.f32`)).arrayBuffer());
+    environments.set(lighting, await Environment.of({height: rows, radiance}));
+  }
+  const made = window.made;
+  if (window.shown !== probe) await made.open(await Take.open(`/${probe}.b4d`));
+  window.shown = probe;
+  Object.assign(made, {environment: environments.get(lighting), lights, rotation, environmentShadows,
+    background: [0.5, 0.5, 0.5]});
+  if (!(await made.render(camera))) throw new Error("nothing was drawn");
+  return [packed(await made.read("lit")), packed(await made.read("picture"))];
+}"""
+
+GREY = (0.5, 0.5, 0.5)
+"""What `SHOW` draws pictures over."""
 
 
 @contextmanager
@@ -108,3 +131,32 @@ def camera_record(camera: Camera) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
     }
+
+
+@contextmanager
+def drawing_pages() -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Open a page with a renderer for each backend, which keeps environments; what pages may fetch comes with them."""
+    files: dict[str, bytes | Path] = {}
+    with chromium() as browser:
+        pages = {backend: open_page(browser, files) for backend in BACKENDS}
+        for backend, page in pages.items():
+            options = {"backend": backend, "shadowMapSize": MAP_SIZE}
+            page.evaluate("async (options) => { window.made = await make(options); }", options)
+        yield files, pages
+
+
+def drawn(
+    golden: Golden, stands: tuple[dict[str, Any], dict[str, Any]], folder: Path
+) -> Iterator[tuple[str, NDArray[np.float32], NDArray[np.uint8]]]:
+    """Yield of each backend radiance times alpha, and alpha, and the picture over grey, ``(SIDE, SIDE, 4)`` each."""
+    (files, pages), shot, key = stands, golden.shot, f"{golden.probe}.b4d"
+    if key not in files:
+        write(GaussianSequence.from_clouds([shot.cloud]), folder / key, WriteOptions(error_scale=0.02))
+        files[key] = folder / key
+    lighting = "dim" if golden.lighting in LAMPS else golden.lighting
+    files[f"{lighting}.f32"] = shot.environment.radiance.tobytes()
+    lamps, camera = lights_to_json(shot.lights), camera_record(shot.camera)
+    asked = [golden.probe, lighting, shot.environment.height, camera, lamps, ROTATION, len(golden.regions or ())]
+    for backend, page in pages.items():
+        lit, picture = page.evaluate(SHOW, asked)
+        yield backend, numbers(lit, SIDE, SIDE, 4), numbers(picture, SIDE, SIDE, 4, dtype=np.uint8)
