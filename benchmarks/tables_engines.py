@@ -8,6 +8,7 @@ from tables import Row, Rows, cell, table
 
 ENGINES = "engine_shading_cpu.json"
 WEB = "web_player_cpu.json"
+STARTS = "view_start_cpu.json"
 BACKENDS = {"webgl2": "WebGL 2", "webgpu": "WebGPU"}
 
 
@@ -44,4 +45,15 @@ def memory(result: Row) -> Rows:
         for name, said in kinds.items():
             rows.append([*head, said, cell(row["held"][name]), "{:.3f} ± {:.3f}".format(*row["growth"][name])])
             head = [""] * len(head)
+    return rows
+
+
+@table("view_start", STARTS)
+def starts(result: Row) -> Rows:
+    """Return how soon beam view answers and its page shows a picture, by kind of asset."""
+    kinds = {"b4d": "a `.b4d` file", "usd": "USD", "ply": "one frame of PLY"}
+    stages = ("served", "answered", "opened", "shown", "drawing")
+    rows: list[list[Any]] = [["asset", "address", "page answered", "take open", "first picture", "of which drawing"]]
+    for row in result["starts"]["rows"]:
+        rows.append([kinds[row["name"]], *("{:.1f} ({:.1f} to {:.1f})".format(*row[stage]) for stage in stages)])
     return rows

@@ -230,6 +230,7 @@ export function prefilterWorker() {
   /** Return the terms (A, B) of the specular albedo, as beam_warp.light.ggx integrates them. */
   function albedoTable() {
     const table = new Float32Array(2 * TABLE * TABLE), AROUND = 32, ACROSS = 64;
+    const around = Float64Array.from({length: AROUND}, (_, i) => Math.cos((i + 0.5) * PI / AROUND)); // a power or a cosine inside takes seconds
     const mean = Array.from({length: ACROSS}, (_, k) => 3 * (1 - (k + 0.5) / ACROSS) ** 2).reduce((a, b) => a + b) / ACROSS;
     for (let row = 0; row < TABLE; row++) for (let column = 0; column < TABLE; column++) {
       const cosine = Math.max((column / (TABLE - 1)) ** 2, 1e-6), sine = Math.sqrt(1 - cosine * cosine), alpha = (row / (TABLE - 1)) ** 2;
@@ -237,14 +238,13 @@ export function prefilterWorker() {
       const lambda = (c) => 0.5 * (Math.sqrt(1 + alpha * alpha * (1 / (c * c) - 1)) - 1), view = 1 + lambda(cosine);
       let a = 0, b = 0;
       for (let k = 0; k < ACROSS; k++) {
-        const left = 1 - (k + 0.5) / ACROSS, height = left ** 3 * (1 + z) - z, weight = 3 * left * left / mean;
+        const left = 1 - (k + 0.5) / ACROSS, height = left * left * left * (1 + z) - z, weight = 3 * left * left / mean;
         const ring = Math.sqrt(Math.max(1 - height * height, 0));
         for (let i = 0; i < AROUND; i++) {
-          const angle = (i + 0.5) * PI / AROUND;
-          const p = alpha * (ring * Math.cos(angle) + x), q = alpha * ring * Math.sin(angle), s = height + z;
-          const size = Math.sqrt(p * p + q * q + s * s), vh = (sine * p + cosine * s) / size, nl = 2 * vh * s / size - cosine;
+          const along = ring * around[i] + x, p = alpha * along, s = height + z, across = ring * ring * (1 - around[i] * around[i]);
+          const size = Math.sqrt(p * p + alpha * alpha * across + s * s), vh = (sine * p + cosine * s) / size, nl = 2 * vh * s / size - cosine;
           if (!(nl > 0)) continue;
-          const masking = weight * view / (view + lambda(nl)), rising = (1 - vh) ** 5;
+          const off = 1 - vh, masking = weight * view / (view + lambda(nl)), rising = off * off * off * off * off;
           a += masking * (1 - rising), b += masking * rising;
         }
       }
@@ -314,7 +314,7 @@ export function prefilterWorker() {
       return {height, radiance: blurred(tree, roughness, height)};
     });
     const irradiance = {height: IRRADIANCE_ROWS, radiance: irradianceOf(map)};
-    return {maps: [irradiance, {height: first.height, radiance: first.radiance}, ...levels], albedo: albedoTable()};
+    return {maps: [irradiance, {height: first.height, radiance: first.radiance}, ...levels]};
   };
 }
 
@@ -370,7 +370,8 @@ export class Environment {
 
   /** Blur a map: `{height, radiance}`, Float32Array of RGB, twice as wide as high. */
   static async of(map) {
-    return Environment.made({map: {height: map.height, radiance: map.radiance}, most: MAX_ROWS});
+    const [made, table] = await Promise.all([Environment.made({map: {height: map.height, radiance: map.radiance}, most: MAX_ROWS}), Environment.table()]);
+    return Object.assign(made, table);
   }
 
   /** Return a number of regions of equal power: `{direction, halfAngle, moments}` each, in the environment's own axes. */
@@ -383,7 +384,12 @@ export class Environment {
   /** Return light of one radiance from everywhere; without arguments, darkness. */
   static async constant(rgb = [0, 0, 0]) {
     const even = (gain) => ({height: 4, radiance: Float32Array.from({length: 96}, (_, k) => gain * rgb[k % 3])});
-    return Object.assign(await Environment.made({}), {maps: [even(Math.PI), ...Array(13).fill(even(1))]});
+    return Object.assign(new Environment(), await Environment.table(), {maps: [even(Math.PI), ...Array(13).fill(even(1))]});
+  }
+
+  /** Return the terms of the specular albedo, which all environments share; the first time a worker finds them. */
+  static table() {
+    return Environment.shared ??= Environment.made({});
   }
 
   static async made(message) {

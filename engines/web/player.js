@@ -62,12 +62,14 @@ export class Player {
   }
 
   async begin() {
+    const name = this.state.environment ?? Object.keys(this.offered())[0];
+    this.light(name).catch(() => {}); // blurred meanwhile; whoever chooses it says what is wrong
     try {
       await this.makeCore();
     } catch (error) {
       return this.say(`This page needs WebGPU or WebGL 2, and this browser offers neither (${error.message}).`, true);
     }
-    const light = this.choose(this.state.environment ?? Object.keys(this.offered())[0]);
+    const light = this.choose(name);
     await this.open(this.source());
     await light;
     this.isLit = true;
@@ -151,14 +153,23 @@ export class Player {
   offered() { return {...Object.fromEntries((this.settings.environments ?? []).map((each) => [each.name, each])),
     ...Object.fromEntries(this.environments), [NONE]: null}; }
 
-  /** Take another environment; it is made ready when it is first asked for. */
-  async choose(name) {
+  /** Return an environment; it is made ready when it is first asked for. */
+  async light(name) {
     const given = this.offered()[name];
+    if (!given) return Environment.constant([0, 0, 0]);
+    if (!(given.hdr || given.url)) return given;
+    const made = Environment.load(given.url ?? bytesOf(given.hdr));
+    this.environments.set(name, made);
+    made.catch(() => this.environments.delete(name));
+    return made;
+  }
+
+  /** Take another environment. */
+  async choose(name) {
     this.wanted = name;
     this.busy(true);
     try {
-      if (given?.hdr || given?.url) this.environments.set(name, await Environment.load(given.url ?? bytesOf(given.hdr)));
-      const light = this.environments.get(name) ?? await Environment.constant([0, 0, 0]);
+      const light = await this.light(name);
       if (this.wanted !== name) return;
       this.relight.environment = light;
       this.change({environment: name});

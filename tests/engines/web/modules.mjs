@@ -14,7 +14,7 @@ const jobs = {
     return {width, height, radiance: Array.from(radiance)};
   },
   prefilter: ({height, radiance}) => {
-    const {maps, albedo} = prefilterWorker()({map: {height, radiance: floats(radiance)}, most: 1024});
+    const handle = prefilterWorker(), {albedo} = handle({}), {maps} = handle({map: {height, radiance: floats(radiance)}, most: 1024});
     return {maps: maps.map((map) => ({height: map.height, radiance: Array.from(map.radiance)})), albedo: Array.from(albedo)};
   },
   lights: ({lights, casters, size}) => checkedLights(lights).map((light) => {
