@@ -3,11 +3,11 @@
     python benchmarks/view_start.py --out result.json [--take take.b4d] [--repeats 5] [--only b4d]
 
 The take is that of `delivery_take.py`; ``--take`` names a file that holds it. It is viewed as a container, as USD, and
-one frame of it as PLY. Each time a new process starts, in a file cache that is warm, and a page opens in a headless Chromium
-that is there already and holds nothing of pages before. Times count from the start of the process: until it prints the
-address, until the page itself is answered, until the take is open in the page, and until the first picture in the
-environment's light is there. Without a GPU, SwiftShader draws on the processor: what all pictures until then took to be
-drawn stands apart, with what it compiles for them.
+one frame of it as PLY. Each time a new process starts, in a file cache that is warm, and a page opens in a headless
+Chromium that is there already and holds nothing of pages before. Times count from the start of the process: until it
+prints the address, until the page itself is answered, until the take is open in the page, and until the first picture
+in the environment's light is there. Without a GPU, SwiftShader draws on the processor: what all pictures until then
+took to be drawn stands apart, with what it compiles for them.
 """
 
 from __future__ import annotations
