@@ -126,7 +126,7 @@ def are_maps_of(rows, views):
 
 @pytest.mark.parametrize(("count", "most"), [(16, 256), (4, 8)])
 def test_regions_of_environments_and_their_maps_are_those_of_the_renderer(adapter, count, most):
-    """Of a map that is black below, and one with more rows than are cut."""
+    """A map is black below, or has more rows than are cut."""
     radiance = np.random.default_rng(3).gamma(0.2, size=(16, 32, 3)).astype(np.float32)
     radiance[10:] = 0.0
     light = EnvironmentMap(radiance)
