@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from beam_warp.digests import array_digest
@@ -165,6 +166,13 @@ def least_share(within: int, pairs: int, confidence: float) -> float:
     """Return the lower limit of a share by Clopper and Pearson, one-sided."""
     test = stats.binomtest(within, pairs, alternative="greater")
     return float(test.proportion_ci(confidence, method="exact").low)
+
+
+def least_bound(errors: NDArray[np.floating], share: float, confidence: float) -> float:
+    """Return the least bound that some draws certify for a share of all; infinite if there are too few draws."""
+    counts = np.arange(1, len(errors) + 1)
+    enough = counts[stats.binom.sf(counts - 1, len(errors), share) <= 1.0 - confidence]  # `least_share` is `share`
+    return float(np.sort(errors)[enough[0] - 1]) if len(enough) else float("inf")
 
 
 def asset_digest(sequence: GaussianSequence) -> str:
