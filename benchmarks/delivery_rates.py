@@ -203,7 +203,7 @@ def _bench(arguments: argparse.Namespace) -> Bench:
     if arguments.quick:
         options = replace(options, height=48, views=4, steps=4)
         return Bench(800, 3, 60, 4, (1.0, 0.3), (1.0, 4.0), options, **paths)
-    return Bench(140_000, 24, 400, 64, (1.0, 0.5, 0.25), (1.0, 2.0, 4.0, 8.0), options, **paths)
+    return Bench(140_000, 24, 400, 64, (1.0, 0.25), (1.0, 2.0, 4.0, 8.0), options, **paths)
 
 
 if __name__ == "__main__":
