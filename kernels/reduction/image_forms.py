@@ -98,7 +98,7 @@ def carry_kernel(
     edges: wp.array[float],
     out_pixels: wp.array2d[float],
 ):
-    """As many columns from ``start`` on of what is carried back: 36 numbers of the form, slope, 1, and zeros."""
+    """Columns from ``start`` on of what is carried back, as many as fit: 36 numbers of the form, slope, 1, zeros."""
     i = first + wp.tid()
     place = places[i]
     for k in range(out_pixels.shape[1]):
