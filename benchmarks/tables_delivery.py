@@ -45,3 +45,15 @@ def codecs(result: Row) -> Rows:
     for row in result["codecs"]["rows"]:
         rows.append([row["name"], row["native"], cell(row["kb_a_frame"], ".1f"), cell(row["ms"], ".2f")])
     return rows
+
+
+@table("delivery_rates", "delivery_rates_cpu.json")
+def rates(result: Row) -> Rows:
+    """Return what takes of 24 frames lose against the truth at which size, as they are and reduced."""
+    rows: list[list[Any]] = [["take", "its PSNR [dB]", "Gaussians", "error scale", "KB a frame", "loss [dB]"]]
+    for name in ("figure", "walker"):
+        found = result[name]
+        for row in found["rows"]:
+            cells = [cell(row["kb_a_frame"], ".0f"), cell(row["loss"], ".2f")]
+            rows.append([name, cell(found["psnr"], ".1f"), f"{row['gaussians']:,}", f"{row['factor']:g}", *cells])
+    return rows

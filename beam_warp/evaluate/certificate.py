@@ -15,7 +15,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from numpy.typing import NDArray
+from scipy import special
 
 from beam_warp.digests import array_digest
 from beam_warp.errors import AssetFormatError, InvalidOptionError
@@ -143,7 +144,7 @@ def certify(
     found = comparison.errors(asset, comparison.trials.draw("certificate", range(first, first + pairs), frames))
     errors = found.values(measure)
     within = int(np.count_nonzero(errors <= bound))
-    spread = stats.t.interval(confidence, max(pairs - 1, 1), errors.mean(), max(errors.std(ddof=1), 1e-12) / pairs**0.5)
+    wide = special.stdtrit(max(pairs - 1, 1), 0.5 + 0.5 * confidence) * max(errors.std(ddof=1), 1e-12) / pairs**0.5
     return Certificate(
         measure=measure,
         bound=float(bound),
@@ -152,7 +153,7 @@ def certify(
         pairs=pairs,
         within=within,
         first=first,
-        mean=(float(errors.mean()), float(spread[0]), float(spread[1])),
+        mean=(float(errors.mean()), float(errors.mean() - wide), float(errors.mean() + wide)),
         psnr=float(found.psnr.mean()),
         asset_psnr=comparison.asset_psnr,
         distribution=comparison.trials.describe(),
@@ -163,8 +164,14 @@ def certify(
 
 def least_share(within: int, pairs: int, confidence: float) -> float:
     """Return the lower limit of a share by Clopper and Pearson, one-sided."""
-    test = stats.binomtest(within, pairs, alternative="greater")
-    return float(test.proportion_ci(confidence, method="exact").low)
+    return float(special.betaincinv(within, pairs - within + 1, 1.0 - confidence)) if within else 0.0
+
+
+def least_bound(errors: NDArray[np.floating], share: float, confidence: float) -> float:
+    """Return the least bound that some draws certify for a share of all; infinite if there are too few draws."""
+    counts = np.arange(1, len(errors) + 1)
+    enough = counts[special.bdtrc(counts - 1, len(errors), share) <= 1.0 - confidence]
+    return float(np.sort(errors)[enough[0] - 1]) if len(enough) else float("inf")
 
 
 def asset_digest(sequence: GaussianSequence) -> str:

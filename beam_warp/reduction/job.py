@@ -15,7 +15,7 @@ from beam_warp.checks import require_count, require_number
 from beam_warp.converters.formats import format_of
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.evaluate.certificate import MOST_PAIRS, Certificate, certify
+from beam_warp.evaluate.certificate import MOST_PAIRS, Certificate, certify, least_bound
 from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, require_flip, world
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.jobs.listeners import StageProgress, no_progress
@@ -47,6 +47,9 @@ FEWEST = 16
 
 SCALES, SIZED_SCALES = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25), (4.0, 1.0)
 """Factors of the bounds of delivery, coarsest first: those that are tried within a bound, and within a size."""
+
+FINEST = 0.03
+"""Factor of the bounds of delivery of a last try: what does not keep a bound with it cannot be delivered within it."""
 
 FOR_GAUSSIANS = 0.85
 """Share of a bound that having fewer Gaussians may use up where delivery takes the rest."""
@@ -139,8 +142,13 @@ class ReduceOptions:
 
 
 def least_pairs(confidence: float) -> int:
-    """Return how many draws, all within the bound, are enough for `SHARE` after one failed certificate."""
-    return int(np.ceil(np.log(0.25 * (1.0 - confidence)) / np.log(SHARE)))
+    """Return how many draws, all within the bound, are enough for `SHARE` in the last try."""
+    return int(np.ceil(np.log(1.0 - _confidence(confidence, TRIES - 1)) / np.log(SHARE)))
+
+
+def _confidence(stated: float, attempt: int) -> float:
+    """Return the confidence that a try needs: each has half of the chance of error that is left."""
+    return 1.0 - (1.0 - stated) * 0.5 ** (attempt + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +252,8 @@ def reduce_asset(
 
     The search sees draws of the distribution's one half alone. The certificate is made on the other half, of what is
     stored. Where a certificate fails, more Gaussians are taken and fresh draws; the chance of error is halved each
-    time, so that the stated confidence holds over all tries.
+    time, so that the stated confidence holds over all tries. The last try takes all Gaussians, as exactly as they can
+    be stored: a refusal names the bound that it would have kept, which is met when it is asked for.
 
     Args:
         original: See `Reducer`.
@@ -276,10 +285,11 @@ def reduce_asset(
             made = _certified(comparison, stored, options, attempt, search)
             if options.bound is None or made.share >= SHARE:
                 break
-            count, scale = min(len(reducer), int(np.ceil(MORE * count))), None if scale is None else 0.5 * scale
+            count, scale = search.more(count, scale, last=attempt == TRIES - 2)
         else:
             raise InvalidOptionError(
-                f"{options.target} must be attainable, got {options.bound:g}: {made}. Allow more, or give more pairs."
+                f"{options.target} must be at least {_least_bound(comparison, stored, made):g} for this asset as "
+                f"{format_of(out).name}, got {options.bound:g}: {made}. Allow that, or write USD."
             )
         final = replace(search.candidate(count), metadata={**original.metadata, **made.as_metadata()})
         paths = converters.write(final, out, _written_as(scale))
@@ -290,7 +300,6 @@ def _certified(
     comparison: RelitComparison, stored: GaussianSequence, options: ReduceOptions, attempt: int, search: _Search
 ) -> Certificate:
     """Return the certificate of one try; without a bound, of what the search found."""
-    tries = 1.0 if options.bound is None else 0.5 ** (attempt + 1)
     return certify(
         comparison,
         stored,
@@ -298,9 +307,19 @@ def _certified(
         bound=HEADROOM * search.error(stored) if options.bound is None else options.bound,
         pairs=options.pairs,
         first=attempt * options.pairs,
-        confidence=1.0 - (1.0 - options.confidence) * tries,
+        confidence=options.confidence if options.bound is None else _confidence(options.confidence, attempt),
         stated=options.confidence,
     )
+
+
+def _least_bound(comparison: RelitComparison, stored: GaussianSequence, failed: Certificate) -> float:
+    """Return the least bound that a certificate on the same draws would have been of, to three digits."""
+    numbers = range(failed.first, failed.first + failed.pairs)
+    draws = comparison.trials.draw("certificate", numbers, range(len(stored)))
+    errors = comparison.errors(stored, draws).values(failed.measure)
+    bound = least_bound(errors, SHARE, _confidence(failed.confidence, TRIES - 1))
+    digit = 10.0 ** (np.floor(np.log10(bound)) - 2)
+    return float(np.ceil(bound / digit) * digit)
 
 
 class _Search:
@@ -332,6 +351,12 @@ class _Search:
         place = self._place.with_stem(f"{self._place.stem}{self._stored}")
         paths = converters.write(self.candidate(count, steps), place, _written_as(scale))
         return converters.read(place), sum(path.stat().st_size for path in paths)
+
+    def more(self, count: int, scale: float | None, *, last: bool) -> tuple[int, float | None]:
+        """Return what to try after a candidate that failed: the most there is if it is the last try."""
+        if last:
+            return len(self._reducer), None if scale is None else FINEST
+        return min(len(self._reducer), int(np.ceil(MORE * count))), None if scale is None else 0.5 * scale
 
     def target(self) -> tuple[int, float | None]:
         """Return how many Gaussians meet the target, and how exactly they are delivered, None for USD."""

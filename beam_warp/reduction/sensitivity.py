@@ -22,6 +22,7 @@ from beam_warp.evaluate.trials import RelitTrials, Trial
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.kernels.raster.project import RasterView
 from beam_warp.kernels.reduction.image_forms import (
+    launch_add_columns,
     launch_add_edges,
     launch_add_forms,
     launch_carry,
@@ -60,8 +61,8 @@ OTHER_BACKGROUNDS = 0.1
 EMPTY_WEIGHT = 0.5
 """Weight of alpha where nothing should be: encoding for display is steepest in the dark."""
 
-FORM, CARRIED, PASS = COLUMNS * (COLUMNS + 1) // 2, 48, 16
-"""Numbers of a form as it is stored; those of a pixel that are carried back, and how many of them at a time."""
+FORM, PASSES = COLUMNS * (COLUMNS + 1) // 2, (16, 16, 8)
+"""Numbers of a form as it is stored; those of a pixel that are carried back, so many at a time."""
 
 TRIANGLE = np.tril_indices(MATERIALS)
 
@@ -137,26 +138,33 @@ def measure_sensitivity(
     """
     meter = _Meter(sequence, trials, raster, resolve_device(device))
     count = len(TRIANGLE[0])
-    views, totals, pixels = [], np.zeros((len(sequence[0]), CARRIED), np.float32), []
+    views, pixels = [], []
     for number, trial in enumerate(cameras):
         progress("measure sensitivity", number, len(cameras))
         some = [lights[(number * LIGHTS + k) % len(lights)] for k in range(LIGHTS)]
-        view, carried, pixel = meter.view(trial, some)
+        view, pixel = meter.view(trial, some)
         views.append(view)
         pixels.append(pixel)
-        totals += carried
+    totals = meter.carried.numpy()
     materials = np.zeros((len(totals), MATERIALS, MATERIALS), np.float32)
     materials[:, TRIANGLE[0], TRIANGLE[1]] = materials[:, TRIANGLE[1], TRIANGLE[0]] = totals[:, :count]
     return Sensitivity(tuple(views), totals[:, count + 1], totals[:, count], materials, float(np.mean(pixels)))
 
 
 class _Meter:
-    """Draws views of a sequence and differentiates their shading."""
+    """Draws views of a sequence and differentiates their shading.
+
+    Attributes:
+        carried: Sums over pixels, by the weight of each Gaussian there, of forms, slopes and 1, ``(N, 40)``.
+    """
 
     def __init__(self, sequence: GaussianSequence, trials: RelitTrials, raster: RasterOptions, device: Any) -> None:
-        self._sequence, self._trials, self._raster, self._device = sequence, trials, raster, device
+        self._sequence, self._trials, self._device = sequence, trials, device
         self._environments = PreparedEnvironments(device, trials.prepared)
-        self._frame = -1
+        self._frame, count = -1, len(sequence[0])
+        self.carried = wp.zeros((count, sum(PASSES)), dtype=float, device=device)
+        some = trials.camera(trials.draw("search", range(1), [0])[0], world(sequence, 0))
+        self._rasterizer = Rasterizer(count, [some], value_count=MATERIALS, options=raster, device=device)
 
     def _show(self, frame: int) -> None:
         """Bring a frame to the device."""
@@ -167,14 +175,12 @@ class _Meter:
         self._arriving = ArrivingLight(len(self._cloud), UNSHADOWED, self._environments, self._device)
         self._casters = ShadowCasters.of(self._cloud)
 
-    def view(self, trial: Trial, lights: Sequence[Trial]) -> tuple[SeenView, FloatArray, float]:
-        """Return a view, what it carries back to Gaussians, and the size of its pixels at the subject."""
+    def view(self, trial: Trial, lights: Sequence[Trial]) -> tuple[SeenView, float]:
+        """Return a view, and the size of its pixels at the subject; what it carries back is added to the rest."""
         self._show(trial.frame)
         camera = self._trials.camera(trial, self._cloud)
-        rasterizer = Rasterizer(
-            len(self._cloud), [camera], value_count=MATERIALS, options=self._raster, device=self._device
-        )
-        images = rasterizer.draw(self._gaussians)
+        self._rasterizer.set_cameras(self._rasterizer.prepare_cameras([camera]))
+        images = self._rasterizer.draw(self._gaussians)
         covered = np.flatnonzero(images.alpha.numpy() > LEAST_ALPHA)
         forms, edges = self._forms(camera, images, covered, lights)
         places = np.full(len(images.alpha), -1, np.int32)
@@ -182,7 +188,8 @@ class _Meter:
         rows = wp.array(places, dtype=int, device=self._device)
         seen = SeenView(camera, trial.frame, wp.clone(images.channels[0]), wp.clone(images.alpha), rows, forms)
         depth = float(np.linalg.norm(camera.position - self._cloud.positions.mean(axis=0)))
-        return seen, self._carried_back(rasterizer, seen, edges), depth / camera.focal_y
+        self._carry_back(seen, edges)
+        return seen, depth / camera.focal_y
 
     def _forms(
         self, camera: Camera, images: RasterImages, covered: NDArray[np.int64], lights: Sequence[Trial]
@@ -218,15 +225,16 @@ class _Meter:
         lamps = tuple(replace(lamp, casts_shadows=False) for lamp in lamps)
         self._arriving.set_lights(lamps, self._casters, moved=False)
 
-    def _carried_back(self, rasterizer: Rasterizer, seen: SeenView, edges: wp.array) -> FloatArray:
-        """Return the sums over pixels, by each Gaussian's weight there, of forms, slopes and 1, ``(N, 48)``."""
-        parts, out = [], wp.empty((len(self._cloud), PASS), dtype=float, device=self._device)
-        pixels = wp.empty((len(edges), PASS), dtype=float, device=self._device)
-        for start in range(0, CARRIED, PASS):
+    def _carry_back(self, seen: SeenView, edges: wp.array) -> None:
+        """Add the sums of a view."""
+        start, count = 0, len(self._cloud)
+        for width in PASSES:
+            pixels = wp.empty((len(edges), width), dtype=float, device=self._device)
+            rows = wp.empty((count, width), dtype=float, device=self._device)
             launch_carry(len(edges), start, seen.places, seen.forms, edges, pixels, self._device)
-            rasterizer.back_project(pixels, out)
-            parts.append(out.numpy().copy())
-        return np.concatenate(parts, axis=1)
+            self._rasterizer.back_project(pixels, rows)
+            launch_add_columns(count, rows, start, self.carried, self._device)
+            start += width
 
 
 def material_rows(cloud: GaussianCloud) -> FloatArray:

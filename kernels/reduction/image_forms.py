@@ -13,7 +13,6 @@ wp.set_module_options({"enable_backward": False})
 COLUMNS = wp.constant(9)
 MATERIALS = wp.constant(8)
 TRIANGLE = wp.constant(36)
-CARRIED = wp.constant(16)
 
 Slopes = wp.types.matrix(shape=(9, 3), dtype=float)
 Sums = wp.types.vector(length=9, dtype=float)
@@ -99,10 +98,10 @@ def carry_kernel(
     edges: wp.array[float],
     out_pixels: wp.array2d[float],
 ):
-    """Columns ``start`` … ``start`` + 15 of what is carried back: 36 numbers of the form, slope, 1, and zeros."""
+    """Columns from ``start`` on of what is carried back, as many as fit: 36 numbers of the form, slope, 1, zeros."""
     i = first + wp.tid()
     place = places[i]
-    for k in range(CARRIED):
+    for k in range(out_pixels.shape[1]):
         column = start + k
         value = float(0.0)
         if column < TRIANGLE:
@@ -113,6 +112,14 @@ def carry_kernel(
         elif column == TRIANGLE + 1:
             value = 1.0
         out_pixels[i, k] = value
+
+
+@wp.kernel
+def add_columns_kernel(first: int, rows: wp.array2d[float], start: int, out_sums: wp.array2d[float]):
+    """Add rows to the columns from ``start`` on."""
+    i = first + wp.tid()
+    for k in range(rows.shape[1]):
+        out_sums[i, start + k] += rows[i, k]
 
 
 @wp.kernel
@@ -158,4 +165,5 @@ launch_nudge = launcher(nudge_kernel)
 launch_add_forms = launcher(add_forms_kernel)
 launch_add_edges = launcher(add_edges_kernel)
 launch_carry = launcher(carry_kernel)
+launch_add_columns = launcher(add_columns_kernel)
 launch_form_slopes = launcher(form_slopes_kernel)

@@ -89,7 +89,7 @@ def test_no_number_is_further_off_than_its_bound(tmp_path_factory, make_cloud, c
     sequence = walk(make_cloud, count, frames, noise=noise, turn=turn, seed=seed)
     path = written(sequence, tmp_path_factory.mktemp("b4d") / "a.b4d", error_scale=scale)
     bounds = Container(path).manifest["bounds"]
-    assert bounds["positions"] == pytest.approx(0.1 * scale * np.median(np.median(sequence[0].scales, axis=1)))
+    assert bounds["positions"] == pytest.approx(0.05 * scale * np.median(np.median(sequence[0].scales, axis=1)))
     rounding = 1e-6 * max(1.0, np.abs(sequence[0].positions).max())
     for cloud, back in pairs(sequence, path) if bounds["positions"] < 0.01 else ():
         assert np.abs(cloud.positions - back.positions).max() <= bounds["positions"] + rounding

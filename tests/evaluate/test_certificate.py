@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom
 
 from beam_warp.errors import AssetFormatError, InvalidOptionError
-from beam_warp.evaluate.certificate import KEY, Certificate, least_share
+from beam_warp.evaluate.certificate import KEY, Certificate, least_bound, least_share
 from beam_warp.evaluate.relit import loss_of
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.world.environment import EnvironmentMap
@@ -48,8 +48,22 @@ def test_the_least_share_is_that_of_a_binomial_law():
 
 def test_shares_are_covered_as_often_as_is_stated():
     rng, true = np.random.default_rng(0), 0.97
-    held = [least_share(int(rng.binomial(200, true)), 200, 0.95) <= true for _ in range(2000)]
-    assert np.mean(held) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 2000)
+    within, times = np.unique(rng.binomial(200, true, 2000), return_counts=True)
+    held = np.array([least_share(int(count), 200, 0.95) <= true for count in within])
+    assert held @ times / 2000 >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 2000)
+
+
+@pytest.mark.parametrize(("count", "confidence"), [(59, 0.95), (200, 0.95), (200, 0.997), (31, 0.5)])
+def test_the_least_bound_is_certified_and_nothing_below_it(count, confidence):
+    errors = np.random.default_rng(count).exponential(size=count)
+    bound = least_bound(errors, 0.95, confidence)
+    within = int(np.count_nonzero(errors <= bound))
+    assert least_share(within, count, confidence) >= 0.95 > least_share(within - 1, count, confidence)
+    assert bound == np.sort(errors)[within - 1]
+
+
+def test_too_few_draws_certify_no_bound():
+    assert least_bound(np.zeros(58), 0.95, 0.95) == np.inf  # 0.95^58 > 0.05
 
 
 def test_independent_errors_as_large_as_those_there_cost_three_decibels():

@@ -147,17 +147,33 @@ def test_a_size_is_kept(tmp_path, few_draws):
 
 
 @pytest.mark.slow
-def test_a_certified_bound_holds_on_fresh_draws(tmp_path):
+@pytest.mark.parametrize("target", [{"max_loss": 6.0}, {"max_flip": 0.1}])
+def test_a_certified_bound_holds_on_fresh_draws(target, tmp_path):
     original = ball(600)
-    options = ReduceOptions(max_loss=6.0, height=48, views=16, steps=60, pairs=120, device="cpu")
+    options = ReduceOptions(**target, height=48, views=16, steps=60, pairs=120, device="cpu")
     found = reduce_asset(original, LIGHTS, options, tmp_path / "small.usda")
     assert found.count < 500
+    assert found.certificate.bound == options.bound
     reducer = Reducer(original, LIGHTS, replace(options, views=1))
-    comparison = RelitComparison(original, reducer.trials, device="cpu")
+    comparison = RelitComparison(original, reducer.trials, measure=options.measure, device="cpu")
     fresh = reducer.trials.draw("certificate", range(5000, 5300), [0])
-    errors = comparison.errors(converters.read(tmp_path / "small.usda"), fresh).values("loss")
+    errors = comparison.errors(converters.read(tmp_path / "small.usda"), fresh).values(options.measure)
     kept = np.mean(errors <= found.certificate.bound)
     assert kept >= found.certificate.share - 3.0 * np.sqrt(0.05 * 0.95 / 300)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_attained_is_refused_with_the_nearest_that_can(tmp_path, few_draws, monkeypatch):
+    monkeypatch.setattr(job, "TRIES", 2)
+    original, out = ball(60), tmp_path / "small.b4d"
+    options = replace(QUICK, gaussians=None, max_flip=1e-6, confidence=0.5, pairs=45, steps=1)
+    with pytest.raises(InvalidOptionError, match=r"max_flip must be at least [\d.e-]+ for this asset") as refused:
+        reduce_asset(original, LIGHTS, options, out)
+    assert not out.exists()
+    nearest = float(str(refused.value).split()[5])
+    found = reduce_asset(original, LIGHTS, replace(options, max_flip=nearest), out)
+    assert found.certificate.share >= job.SHARE
+    assert out.is_file()
 
 
 @pytest.mark.parametrize(
