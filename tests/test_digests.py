@@ -67,7 +67,7 @@ def test_the_digest_of_this_package_is_found_once():
 
 
 def test_a_checkout_in_the_way_of_the_installed_package_is_named():
-    """Python, and so Ray, looks in the working folder first; there, ``kernels`` lies beside ``beam_warp``, not in it."""
+    """Python, and so Ray, looks in the working folder first, where ``kernels`` lies beside ``beam_warp``."""
     checkout = Path(__file__).parents[1]
     if not (checkout / "kernels").is_dir():
         pytest.skip("tests of an installed package lie beside no checkout")
