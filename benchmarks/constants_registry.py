@@ -519,7 +519,7 @@ UNTUNED = {
         beam_warp.render.sheet: WHITE_IRRADIANCE""",
     "what a user asks for, or the quality that a user pays for": """
         FitOptions: gaussian_count seed
-        ReconstructOptions: segment_length
+        ReconstructOptions: segment_length seam_frames
         MaterialOptions: seed
         ImagePathOptions: seed
         BakeOptions: seed steps

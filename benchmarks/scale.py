@@ -176,7 +176,7 @@ def takes(bench: Bench) -> Iterator[Row]:
     survey, clip = (CLIP_FRAMES * written[name] for name in ("survey", "clip"))
     seconds = {
         "key_frame": known["key_frame"],
-        "frame": known["tracked_frame"],
+        **dict.fromkeys(("frame", "seam"), known["tracked_frame"]),
         "materials": known["materials"],
         "light": 0.0,
         "preview": 0.0,
