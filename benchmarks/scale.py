@@ -239,7 +239,7 @@ class Naps:
 
 def check(bench: Bench) -> Iterator[Row]:
     """Compare the simulation with processes that sleep through the plan of 16 segments, two assets included."""
-    seconds = {"key_frame": 12.0, "frame": 11.0, "materials": 3.0, "light": 1.0, "preview": 1.0}
+    seconds = {"key_frame": 12.0, "frame": 11.0, "seam": 11.0, "materials": 3.0, "light": 1.0, "preview": 1.0}
     seconds |= {f"{asset}-{stage}": 3.0 for asset in ASSETS for stage in ("survey", "clip", "whole")}
     naps = {stage: bench.nap * spent for stage, spent in seconds.items()}
     steps = as_stages(take_steps(16 * 5, 5))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import mean
 from typing import Any
 
 from tables import Row, Rows, cell, number, table
@@ -92,11 +93,14 @@ def memory(result: Row) -> Rows:
     return rows
 
 
+@table("scale_seams_faded", "seams_cpu.json")
 @table("scale_seams", "seams_h200.json")
 def seams(result: Row) -> Rows:
-    """Return flicker of pairs of frames with a seam between them, of the same pairs without, and of all others."""
-    found, one = result["flicker"]["segments"], result["flicker"]["one"]
-    rows: list[list[Any]] = [["pairs of frames", "in segments", "in one segment"]]
+    """Return flicker of pairs of frames with a seam between them, of all others, and what the error is."""
+    names = {"segments": "segments, cut", "faded": "segments, faded", "one": "one segment"}
+    found = {label: result["flicker"][name] for name, label in names.items() if name in result["flicker"]}
+    rows: list[list[Any]] = [["pairs of frames", *found]]
     for label, name in (("with a seam between them", "at_seams"), ("all others", "elsewhere")):
-        rows.append([label, cell(found[name], ".2f"), cell(one[name], ".2f")])
+        rows.append([label, *(cell(row[name], ".2f") for row in found.values())])
+    rows.append(["error itself", *(cell(mean(row["error"]), ".2f") for row in found.values())])
     return rows

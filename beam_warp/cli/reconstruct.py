@@ -48,9 +48,7 @@ class Modelling:
     ] = 0
     seam_frames: Annotated[
         int,
-        arg(
-            metavar="N", help="Frames in which a segment fades into the next one; each is tracked twice."
-        ),
+        arg(metavar="N", help="Frames in which a segment fades into the next one; each is tracked twice."),
         SECOND_PAGE,
     ] = 2
     cameras: Annotated[
