@@ -78,14 +78,14 @@ def workers(result: Row) -> Rows:
     return rows
 
 
+@table("scale_memory_receipts", "memory_cpu.json")
 @table("scale_memory", "memory_h200.json")
 def memory(result: Row) -> Rows:
     """Return what a process holds after the first tenth of a take and at its end."""
     rows: list[list[Any]] = [
         ["memory", "frames", "first [MB]", "last [MB]", "growth a frame [kB]", "over 1,000 frames"]
     ]
-    for kind in ("host", "device"):
-        found = result[kind]
+    for kind, found in ((kind, result[kind]) for kind in ("host", "device") if kind in result):
         slope, error = (round(found[name] / 1e3, 1) + 0.0 for name in ("bytes_a_frame", "standard_error"))
         ends = [cell(found[end], ".1f", factor=1e-6) for end in ("first_bytes", "last_bytes")]
         part = 1000.0 * 1e3 * slope / found["first_bytes"]
