@@ -40,7 +40,7 @@ from beam_warp.plan.steps import Plan, Receipt, Step, Task
 from beam_warp.plan.workers import InProcess
 from beam_warp.reconstruction.frames.plan import FramePlan, plan_segments
 from beam_warp.reconstruction.job import ReconstructionWork, ReconstructOptions
-from beam_warp.schema.writer import CLIP_FRAMES
+from beam_warp.schema.clips import CLIP_FRAMES
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
