@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import importlib
 import importlib.util
 import time
 from collections.abc import Callable, Mapping
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.errors import MissingFileError
+from beam_warp.errors import MissingFileError, MissingPackageError
 
 RACE_SECONDS = 2.0
 """Coarsest time step of usual file systems (FAT)."""
@@ -37,6 +38,9 @@ def code_digest() -> str:
 
     Files are hashed as text, comments and docstrings included: telling them apart would mean to parse the whole
     package, which costs a second. So an edited comment makes jobs start over, and no changed algorithm goes unnoticed.
+
+    Raises:
+        MissingPackageError: Python found a checkout's folder before the installed package.
     """
     folders = {"": _folder_of("beam_warp")}
     folders |= {name: _folder_of(f"beam_warp.{name}") for name in MAPPED_PACKAGES}
@@ -69,8 +73,12 @@ def source_digest(folders: Mapping[str, Path]) -> str:
 def _folder_of(package: str) -> Path:
     """Return the folder of an installed package, without importing it."""
     spec = importlib.util.find_spec(package)
-    assert spec is not None
-    assert spec.submodule_search_locations is not None
+    if spec is None or not spec.submodule_search_locations:
+        folder = Path(importlib.import_module("beam_warp").__path__[0])
+        raise MissingPackageError(
+            f"beam_warp must be the installed package, got the folder of a checkout without {package} at {folder}. "
+            f"Start this program, or the Ray that runs it, in another folder than {folder.parent}."
+        )
     return Path(spec.submodule_search_locations[0])
 
 

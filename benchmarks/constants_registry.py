@@ -519,7 +519,7 @@ UNTUNED = {
         beam_warp.render.sheet: WHITE_IRRADIANCE""",
     "what a user asks for, or the quality that a user pays for": """
         FitOptions: gaussian_count seed
-        ReconstructOptions: segment_length
+        ReconstructOptions: segment_length seam_frames
         MaterialOptions: seed
         ImagePathOptions: seed
         BakeOptions: seed steps
@@ -578,7 +578,7 @@ UNTUNED = {
         beam_warp.kernels.render.path_tracing: FIRST_PAIRS VERTEX_PAIRS""",
     "how results are scored and shown": """
         beam_warp.reconstruction.drift: NEAR LEAST_OPACITY CARRIERS
-        beam_warp.reconstruction.preview: AMPLIFICATION MOST_ROWS FEWEST_ROWS
+        beam_warp.reconstruction.preview: AMPLIFICATION MOST_ROWS FUSED_ROWS FEWEST_ROWS
         beam_warp.render.channels: MOST_GAUSSIANS TEXT_COLOR TEXT_SIZE LINE_HEIGHT MARGIN""",
     "numbers of cases and of columns": """
         beam_warp.kernels.reconstruction.visual_hull: OUTSIDE SURFACE INSIDE

@@ -1,6 +1,6 @@
 """Memory of a long take: one process reconstructs and decomposes small frames, and says what it holds after each.
 
-    python benchmarks/memory.py [--quick] [--frames N] --out result.json
+    python benchmarks/memory.py [--quick] [--tiny] [--frames N] --out result.json
 
 The take is that of `beam_warp.demo.capture`: eight cameras, whose few frames are named over and over, to and fro. After
 the materials of each frame, the memory of the process that is resident and, on CUDA, what is allocated of the device
@@ -35,16 +35,17 @@ from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.reconstruction.job import ReconstructionWork, ReconstructOptions
 from beam_warp.world.environment import EnvironmentMap
 
-SIDE, CAMERAS, GAUSSIANS, SEGMENT = 64, 8, 2000, 25
+SMALL, TINY = (64, 8, 2000), (24, 3, 100)
+"""Side of the images [pixel], cameras, and Gaussians."""
+
+SEGMENT = 25
 DRAWN = 8
 """Frames that are path traced; all others show one of them again."""
 
 WARM, BLOCK = 0.1, 20
 """Part of the frames that is left out at the start, and the number of blocks that the rest is parted into."""
 
-FEW = FromImagesOptions(
-    gaussian_count=GAUSSIANS, color_iterations=2, normal_iterations=2, joint_iterations=2, track_iterations=2
-)
+FEW = FromImagesOptions(color_iterations=2, normal_iterations=2, joint_iterations=2, track_iterations=2)
 """Steps of a frame: enough to run through all code, for memory does not depend on their number."""
 
 
@@ -54,6 +55,7 @@ class Witness:
 
     device: Any
     keep: Any
+    size: tuple[int, int, int]
     resident: list[int] = field(default_factory=list)
     allocated: list[int] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
@@ -73,7 +75,10 @@ class Witness:
         """Return what was noted, and how it grows."""
         found = {"host": self.resident, "device": self.allocated}
         return {
-            "take": {"frames": len(self.resident), "side": SIDE, "cameras": CAMERAS, "gaussians": GAUSSIANS},
+            "take": {
+                "frames": len(self.resident),
+                **dict(zip(("side", "cameras", "gaussians"), self.size, strict=True)),
+            },
             "seconds": time.perf_counter() - self.started,
             **{name: growth(values) for name, values in found.items() if len(values) >= 4 * BLOCK},
             "samples": {name: values[:: max(len(values) // 200, 1)] for name, values in found.items()},
@@ -101,10 +106,10 @@ def growth(values: list[int]) -> dict[str, float]:
     }
 
 
-def long_capture(folder: Path, frames: int, device: str | None) -> Capture:
+def long_capture(folder: Path, frames: int, side: int, cameras: int, device: str | None) -> Capture:
     """Return a capture whose frames show those of a short one over and over, to and fro."""
     short = write_demo_capture(
-        folder, frame_count=DRAWN, camera_count=CAMERAS, test_camera_count=0, size=SIDE, samples=4, device=device
+        folder, frame_count=DRAWN, camera_count=cameras, test_camera_count=0, size=side, samples=4, device=device
     )
     by_frame = {frame: short.select(split="train", frames={frame}) for frame in range(DRAWN)}
     shown = [abs((frame + DRAWN - 1) % (2 * DRAWN - 2) - DRAWN + 1) for frame in range(frames)]
@@ -115,15 +120,18 @@ def long_capture(folder: Path, frames: int, device: str | None) -> Capture:
 def main() -> None:
     """Measure, and write the result every few frames."""
     parser = record.parser(__doc__, device=None, quick="100 frames, to see whether it runs")
+    parser.add_argument("--tiny", action="store_true", help="images and models as small as they can be, for a CPU")
     parser.add_argument("--frames", type=int, default=1000)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
+    side, cameras, gaussians = size = TINY if arguments.tiny else SMALL
     with tempfile.TemporaryDirectory() as name:
         out = Path(name) / "out"
         out.mkdir()
-        capture = long_capture(Path(name) / "capture", 100 if arguments.quick else arguments.frames, arguments.device)
-        witness = Witness(device, functools.partial(record.write_result, arguments, device))
-        steps = demo_steps(FEW, device=arguments.device, seed=0)
+        count = 100 if arguments.quick else arguments.frames
+        capture = long_capture(Path(name) / "capture", count, side, cameras, arguments.device)
+        witness = Witness(device, functools.partial(record.write_result, arguments, device), size)
+        steps = demo_steps(replace(FEW, gaussian_count=gaussians), device=arguments.device, seed=0)
         options = ReconstructOptions(segment_length=SEGMENT, cameras="keep", masks="keep", exposures="keep")
         frames = ReconstructionWork.prepare(capture, out / "reconstruction", steps, options)
         light = EnvironmentMap.read(capture.environment_path or "")

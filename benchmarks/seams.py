@@ -1,6 +1,8 @@
 """Flicker at the seams of segments: renders of a take that was reconstructed in segments, and of the same in one.
 
-    python benchmarks/seams.py [--quick] --out result.json
+    python benchmarks/seams.py [--small | --quick] --out result.json
+
+Segments are cut, or faded into each other as by default.
 
 The take is that of `beam_warp.demo.capture`, photographed without noise that matters. Two frames that follow each other
 differ because the figure moves, which the truth says; what else differs is flicker. Its size is the root mean square,
@@ -15,7 +17,7 @@ from __future__ import annotations
 import functools
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -100,20 +102,26 @@ def flicker(bench: Bench) -> Iterator[Row]:
             device=bench.device,
         )
         result: Row = {"frames": bench.frames, "segment": bench.segment, "size": bench.size, "cameras": bench.cameras}
-        for label, length in (("segments", bench.segment), ("one", 0)):
-            options = ReconstructOptions(segment_length=length, cameras="keep", masks="keep", exposures="keep")
-            made = reconstruct(capture, Path(name) / label, bench.steps, options)
+        mended = ReconstructOptions(cameras="keep", masks="keep", exposures="keep")
+        for label, changes in (
+            ("segments", {"segment_length": bench.segment, "seam_frames": 0}),
+            ("faded", {"segment_length": bench.segment}),
+            ("one", {}),
+        ):
+            # One folder: what they have in common is made once.
+            made = reconstruct(capture, Path(name) / "made", bench.steps, replace(mended, **changes))
             off = errors(capture, made.sequence, bench.steps)
-            changes = [rms(np.stack([b - a for a, b in zip(*pair, strict=True)])) for pair in pairwise(off)]
+            steps = [rms(np.stack([b - a for a, b in zip(*pair, strict=True)])) for pair in pairwise(off)]
             at = range(bench.segment - 1, bench.frames - 1, bench.segment)
             result[label] = {
-                "pairs": changes,
+                "pairs": steps,
                 "error": [rms(np.stack(views)) for views in off],
-                "at_seams": float(np.mean([changes[number] for number in at])),
-                "elsewhere": float(np.mean([change for number, change in enumerate(changes) if number not in at])),
-                "worst": float(max(changes)),
+                "at_seams": float(np.mean([steps[number] for number in at])),
+                "elsewhere": float(np.mean([step for number, step in enumerate(steps) if number not in at])),
+                "worst": float(max(steps)),
                 "psnr": made.report["mean_psnr"],
                 "segments": made.report["segments"],
+                "seam_frames": made.report["options"]["seam_frames"],
             }
             say(str(result[label]))
             yield result
@@ -122,11 +130,17 @@ def flicker(bench: Bench) -> Iterator[Row]:
 def main() -> None:
     """Measure, and write the result."""
     parser = record.parser(__doc__, device=None, quick="small and few steps, to see whether it runs")
+    parser.add_argument("--small", action="store_true", help="as much as a CPU does in some minutes")
     arguments = parser.parse_args()
     device = arguments.device
     if arguments.quick:
         few = demo_steps(FromImagesOptions(gaussian_count=3000), device=device, seed=0)
         bench = Bench(4, 2, 96, 10, 8, few, device)
+    elif arguments.small:
+        size = FromImagesOptions(
+            gaussian_count=5000, color_iterations=80, normal_iterations=160, joint_iterations=60, track_iterations=60
+        )
+        bench = Bench(9, 3, 112, 12, 32, demo_steps(size, device=device, seed=0), device)
     else:
         bench = Bench(8, 2, 256, 16, 64, FitAndTrack(fitting=FitOptions(gaussian_count=20_000), device=device), device)
     keep = functools.partial(record.write_result, arguments, resolve_device(device))

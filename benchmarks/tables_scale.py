@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import mean
 from typing import Any
 
 from tables import Row, Rows, cell, number, table
@@ -77,14 +78,14 @@ def workers(result: Row) -> Rows:
     return rows
 
 
+@table("scale_memory_receipts", "memory_cpu.json")
 @table("scale_memory", "memory_h200.json")
 def memory(result: Row) -> Rows:
     """Return what a process holds after the first tenth of a take and at its end."""
     rows: list[list[Any]] = [
         ["memory", "frames", "first [MB]", "last [MB]", "growth a frame [kB]", "over 1,000 frames"]
     ]
-    for kind in ("host", "device"):
-        found = result[kind]
+    for kind, found in ((kind, result[kind]) for kind in ("host", "device") if kind in result):
         slope, error = (round(found[name] / 1e3, 1) + 0.0 for name in ("bytes_a_frame", "standard_error"))
         ends = [cell(found[end], ".1f", factor=1e-6) for end in ("first_bytes", "last_bytes")]
         part = 1000.0 * 1e3 * slope / found["first_bytes"]
@@ -92,11 +93,14 @@ def memory(result: Row) -> Rows:
     return rows
 
 
+@table("scale_seams_faded", "seams_cpu.json")
 @table("scale_seams", "seams_h200.json")
 def seams(result: Row) -> Rows:
-    """Return flicker of pairs of frames with a seam between them, of the same pairs without, and of all others."""
-    found, one = result["flicker"]["segments"], result["flicker"]["one"]
-    rows: list[list[Any]] = [["pairs of frames", "in segments", "in one segment"]]
+    """Return flicker of pairs of frames with a seam between them, of all others, and what the error is."""
+    names = {"segments": "segments, cut", "faded": "segments, faded", "one": "one segment"}
+    found = {label: result["flicker"][name] for name, label in names.items() if name in result["flicker"]}
+    rows: list[list[Any]] = [["pairs of frames", *found]]
     for label, name in (("with a seam between them", "at_seams"), ("all others", "elsewhere")):
-        rows.append([label, cell(found[name], ".2f"), cell(one[name], ".2f")])
+        rows.append([label, *(cell(row[name], ".2f") for row in found.values())])
+    rows.append(["error itself", *(cell(mean(row["error"]), ".2f") for row in found.values())])
     return rows

@@ -2,7 +2,8 @@
 
 A clip must be written in the precision that is safe for the whole sequence, and hold what varies in it. So the frames
 of each clip are surveyed first, as soon as they are made; the surveys are added up; and then the clips are written, in
-any order. The result has the same bytes as `beam_warp.converters.write` of the whole sequence.
+any order. The result has the same bytes as `beam_warp.converters.write` of the whole sequence. OpenUSD is loaded by the
+steps alone: whoever hands them out, and workers that do others, start without it.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ from dataclasses import asdict, dataclass
 from functools import cached_property, reduce
 from operator import add
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from beam_warp.converters import usd
 from beam_warp.converters.common.options import WriteOptions
 from beam_warp.digests import code_digest
 from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.plan.steps import Plan, Rank, Receipt, Step, Task
-from beam_warp.schema.survey import FramesSurvey, Survey
-from beam_warp.schema.writer import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER, WrittenClips, clip_name, write_clip
+from beam_warp.schema.clips import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER, clip_name
 from beam_warp.world.gaussians import GaussianSequence
+
+if TYPE_CHECKING:
+    from beam_warp.schema.survey import Survey
 
 FOLDER = "clips"
 """Folder of the clips, in that of the asset; the asset's own are second names of the same files."""
@@ -63,6 +65,9 @@ class ClipWork:
 
     def write(self, sequence: GaussianSequence, path: Path, receipts: Mapping[str, Receipt]) -> list[Path]:
         """Write an asset, or what is left of it to write when all steps are done; return its files, the root last."""
+        from beam_warp.converters import usd
+        from beam_warp.schema.writer import WrittenClips
+
         known = receipts.get(self._whole)
         clips = None if known is None else WrittenClips(_survey_of(known.facts), self.folder / FOLDER)
         return usd.write(sequence, path, WriteOptions(), clips)
@@ -81,6 +86,8 @@ class ClipWork:
 
     @cached_property
     def _sequence(self) -> GaussianSequence:
+        from beam_warp.converters import usd
+
         return usd.prepared(self.read())
 
     def __getstate__(self) -> dict[str, Any]:
@@ -102,6 +109,9 @@ class ClipWork:
 
     def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
         """Survey the frames of a clip, add surveys up, or write a clip."""
+        from beam_warp.schema.survey import FramesSurvey, Survey
+        from beam_warp.schema.writer import write_clip
+
         step, start = task.step, _start(task.step)
         if step.stage == self._survey:
             frames = range(len(self._sequence))[start : start + CLIP_FRAMES]
@@ -127,5 +137,7 @@ def _start(step: Step) -> int:
 
 def _survey_of(facts: Mapping[str, Any]) -> Survey:
     """Return a survey that a receipt holds."""
+    from beam_warp.schema.survey import Survey
+
     kinds = {"counts": tuple, "names": tuple, "varying": frozenset, "half": frozenset}
     return Survey(**{name: kinds.get(name, lambda it: it)(value) for name, value in facts.items()})

@@ -32,18 +32,13 @@ from beam_warp.schema.authoring import (
     define,
     static_layer,
 )
+from beam_warp.schema.clips import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER, clip_name
 from beam_warp.schema.layout import ASSET_PATH, SPLATS_PATH
 from beam_warp.schema.staging import publish_asset, staged_folder
 from beam_warp.schema.survey import Survey, survey_sequence
 from beam_warp.world.gaussians import GaussianSequence
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
-
-MAX_FRAMES_IN_ONE_LAYER = 60
-"""Most frames of a ``.usda`` or ``.usdz`` asset without value clips."""
-
-CLIP_FRAMES = 30
-"""Frames in one value clip."""
 
 USDZ_LIMIT = 2**32
 """Size that an archive must stay below [byte], since OpenUSD does not read ZIP64."""
@@ -146,11 +141,6 @@ class WrittenClips:
 
     survey: Survey
     folder: Path
-
-
-def clip_name(stem: str, start: int) -> str:
-    """Return the name of the clip that begins with a frame."""
-    return f"{stem}.{start:06d}.usdc"
 
 
 def write_clip(sequence: GaussianSequence, survey: Survey, start: int, path: Path) -> None:

@@ -1,5 +1,10 @@
 """The digest of the code: the same wherever it lies, another when a source changes."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from beam_warp.digests import code_digest, source_digest
@@ -59,3 +64,18 @@ def test_any_change_of_a_source_shows(wheel, change):
 def test_the_digest_of_this_package_is_found_once():
     assert len(code_digest()) == 32
     assert code_digest() is code_digest()
+
+
+def test_a_checkout_in_the_way_of_the_installed_package_is_named():
+    """Python, and so Ray, looks in the working folder first, where ``kernels`` lies beside ``beam_warp``."""
+    checkout = Path(__file__).parents[1]
+    if not (checkout / "kernels").is_dir():
+        pytest.skip("tests of an installed package lie beside no checkout")
+    program = "from beam_warp.digests import code_digest; code_digest()"
+    usual = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    said = subprocess.run(
+        [sys.executable, "-c", program], cwd=checkout, env=usual, capture_output=True, text=True, check=False
+    )
+    assert said.stderr.splitlines()[-1].startswith(
+        "beam_warp.errors.MissingPackageError: beam_warp must be the installed package, got the folder of a checkout"
+    )

@@ -46,6 +46,11 @@ class Modelling:
     segment_length: Annotated[
         int, arg(metavar="K", help="Frames from one key frame to the next, which workers share out; 0 for one segment.")
     ] = 0
+    seam_frames: Annotated[
+        int,
+        arg(metavar="N", help="Frames in which a segment fades into the next one; each is tracked twice."),
+        SECOND_PAGE,
+    ] = 2
     cameras: Annotated[
         Literal["refine", "keep"],
         arg(help="Correct cameras that are beyond doubt wrong, or keep all as the capture states them."),
@@ -263,6 +268,7 @@ def options_of(modelling: Modelling, capture: Capture) -> ReconstructOptions:
     frames = None if modelling.frames is None else frames_of(modelling.frames, capture.frames)
     return ReconstructOptions(
         segment_length=modelling.segment_length,
+        seam_frames=modelling.seam_frames,
         frames=frames,
         cameras=modelling.cameras,
         masks=modelling.masks,

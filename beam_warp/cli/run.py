@@ -160,7 +160,7 @@ def _check_words(args: Run, capture: Capture | None) -> None:
     """Refuse words that do not go with the input."""
     if capture is None and args.modelling != Modelling():
         raise InvalidOptionError(
-            "gaussians, preset, segment-length, cameras, masks, exposures and frames must be left out "
+            "gaussians, preset, segment-length, seam-frames, cameras, masks, exposures and frames must be left out "
             f"unless the input is a capture, got {args.input}. Drop them."
         )
     of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from beam_warp.capture.capture import Capture
-from beam_warp.reconstruction.job import ReconstructionWork, frame_step
+from beam_warp.reconstruction.job import ReconstructionWork
 from beam_warp.world.gaussians import GaussianSequence
 
 
@@ -36,7 +36,7 @@ class Frames(Protocol):
         ...
 
     def step(self, number: int) -> tuple[str, ...]:
-        """Return the name of the step that makes a frame; nothing for one that is there."""
+        """Return the names of the steps that make a frame; nothing for one that is there."""
         ...
 
     def sequence(self) -> GaussianSequence:
@@ -125,8 +125,8 @@ class ReconstructedFrames:
         return self.work.may_be_constant
 
     def step(self, number: int) -> tuple[str, ...]:
-        """Return the name of the step that makes a frame."""
-        return (frame_step(number),)
+        """Return the names of the steps that make a frame."""
+        return self.work.makers(number)
 
     def sequence(self) -> GaussianSequence:
         """Return the frames without looking whether their topology is constant."""

@@ -54,23 +54,24 @@ class Measurements:
     @classmethod
     def of(cls, receipts: Mapping[str, Receipt], numbers: Sequence[int]) -> Measurements:
         """Add up the receipts of all steps, given what the frames are called."""
+        shared = [receipts[name] for name in ("light", "roughness") if name in receipts]
         frames = [receipts[material_step(number)] for number in numbers]
-        steps = [*filter(None, map(receipts.get, ("light", "roughness"))), *frames]
-        fresh = [step for step in steps if not step.is_kept]
-        estimates = [step.facts["roughness"] for step in steps if "roughness" in step.facts]
+        steps = [(step, dict(step.facts)) for step in (*shared, *frames)]  # which reads them, once
+        said = [facts for _, facts in steps[len(shared) :]]
+        estimates = [facts["roughness"] for _, facts in steps if "roughness" in facts]
         seconds: dict[str, float] = {}
-        for step in fresh:
-            for stage, spent in step.facts["seconds"].items():
+        for step, facts in steps:
+            for stage, spent in facts["seconds"].items() if not step.is_kept else ():
                 seconds[stage] = seconds.get(stage, 0.0) + spent
         return cls(
             resumed=sum(frame.is_kept for frame in frames),
-            ray_count=sum(frame.facts["ray_count"] for frame in frames if not frame.is_kept),
-            economy=summary([frame.facts["economy"] for frame in frames]),
-            notes=list(dict.fromkeys(note for frame in frames for note in frame.facts["notes"])),
-            counts=[frame.facts.get("counts", {}) for frame in frames],
+            ray_count=sum(facts["ray_count"] for frame, facts in zip(frames, said, strict=True) if not frame.is_kept),
+            economy=summary([facts["economy"] for facts in said]),
+            notes=list(dict.fromkeys(note for facts in said for note in facts["notes"])),
+            counts=[facts.get("counts", {}) for facts in said],
             roughness=estimates[-1] if estimates else {},
             seconds=seconds,
-            workers=sorted({step.worker for step in steps}),
+            workers=sorted({step.worker for step, _ in steps}),
         )
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special  # scipy.stats takes most of a second to import
 
 from beam_warp.materials.base_color import BaseColor, least_squares, misfit_error
 from beam_warp.materials.direct import ColorEvidence
@@ -72,8 +73,6 @@ class ChangeTest:
 
     def result(self) -> ColorChange:
         """Test every Gaussian; false discoveries are bounded over all of them (Benjamini and Hochberg 1995)."""
-        from scipy import stats  # is slow to import, and few jobs come here
-
         frames, weights, sums, squares = self._sums
         mean = np.divide(sums, weights, out=np.zeros_like(weights), where=weights > 0.0)
         q = np.maximum(squares - mean * sums, 0.0)
@@ -82,7 +81,7 @@ class ChangeTest:
         tested = freedom > 0.0
         dispersion = 1.0
         if tested.any():
-            excess = total[tested] / stats.chi2.ppf(REFERENCE_QUANTILE, freedom[tested])
+            excess = total[tested] / (2.0 * special.gammaincinv(freedom[tested] / 2.0, REFERENCE_QUANTILE))
             dispersion = max(float(np.quantile(excess, REFERENCE_QUANTILE)), 1.0)
         variance = np.zeros_like(mean)
         np.divide(
@@ -94,9 +93,15 @@ class ChangeTest:
         large = np.sqrt(variance.mean(axis=1)) >= LEAST_CHANGE
         changing = large & tested
         if tested.any():
-            chance = stats.false_discovery_control(stats.chi2.sf(total[tested] / dispersion, freedom[tested]))
-            changing[tested] &= chance <= FALSE_DISCOVERIES
+            changing[tested] &= _discovered(special.chdtrc(freedom[tested], total[tested] / dispersion))
         return ColorChange(changing, mean, np.where(changing[:, None], variance, 0.0), dispersion)
+
+
+def _discovered(chance: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which probabilities are discoveries, of which `FALSE_DISCOVERIES` at most are false (Benjamini, Hochberg)."""
+    order = np.sort(chance)
+    below = order <= FALSE_DISCOVERIES * np.arange(1, len(order) + 1) / len(order)
+    return chance <= order[below].max(initial=-1.0)
 
 
 def with_changes(constant: BaseColor, change: ColorChange, evidence: ColorEvidence) -> BaseColor:

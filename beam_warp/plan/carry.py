@@ -14,7 +14,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from beam_warp.plan.steps import (
     Plan,
     Receipt,
     Step,
+    StoredFacts,
     Task,
     awaited_files,
     is_whole,
@@ -129,7 +130,7 @@ def carry_out(
         patience: How long steps may take.
 
     Returns:
-        The receipts of all steps, by name.
+        The receipts of all steps, by name; their facts are read from files when they are asked for.
 
     Raises:
         UnfinishedError: Several steps failed, or one by a mistake of the program; all others that can be are done.
@@ -184,7 +185,8 @@ def _take(job: _Job, outcome: Outcome, watch: Watch) -> None:
     name, step = outcome.name, job.schedule.steps[outcome.name]
     del job.running[name]
     if outcome.receipt is not None:
-        job.receipts[name] = outcome.receipt
+        stored = StoredFacts(_folder(job, name), name, outcome.receipt.key)
+        job.receipts[name] = replace(outcome.receipt, facts=stored)
         if not outcome.receipt.is_kept:
             job.times.setdefault(step.stage, deque(maxlen=LATEST)).append(outcome.receipt.seconds)
         job.errors.pop(name, None)

@@ -13,7 +13,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -147,6 +147,38 @@ class Task:
     awaited: tuple[tuple[str, int], ...] = ()
     following: tuple[Step, ...] = ()
     facts: tuple[Mapping[str, Any], ...] = ()
+
+
+class StoredFacts(Mapping[str, Any]):
+    """Facts of a receipt, read from its file whenever they are asked for: memory does not grow by what steps say."""
+
+    def __init__(self, folder: Path, name: str, key: str) -> None:
+        """Take the folder of the work, the name of the step and the key of its receipt."""
+        self._place, self._key = (folder, name), key
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a fact."""
+        return self._read()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the names of all facts."""
+        return iter(self._read())
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._read())
+
+    def _read(self) -> Mapping[str, Any]:
+        """Read the receipt, which another machine's writer may make visible late."""
+        end = time.monotonic() + PATIENCE
+        while (receipt := read_receipt(*self._place)) is None or receipt.key != self._key:
+            if time.monotonic() >= end:
+                raise MissingFileError(
+                    f"receipt must stay where it was written, got no such one at {receipt_path(*self._place)}. "
+                    "Call again: the step is then done anew."
+                )
+            time.sleep(0.1)
+        return receipt.facts
 
 
 def perform(works: Mapping[str, Work], task: Task, progress: NotedProgress) -> Receipt:

@@ -12,6 +12,7 @@ tracking is lost becomes a key frame itself.
     read            frames.reader   images and digests of a frame
     start, fit      steps.begin     a key frame, from its images alone
     track           steps.advance   a further frame, from the stored one before
+    seam            steps.advance   likewise, beyond a segment's end: it is faded into the next one
     store           frames.store    one file a frame
     write           this module     asset, previews, report
 
@@ -53,7 +54,7 @@ from beam_warp.plan.steps import Plan, Rank, Receipt, Step, Task
 from beam_warp.plan.workers import Crew, in_process
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.frames.model import model_frame, within
-from beam_warp.reconstruction.frames.plan import FramePlan, plan_frames
+from beam_warp.reconstruction.frames.plan import FramePlan, plan_fades, plan_frames
 from beam_warp.reconstruction.frames.protocols import FrameSteps
 from beam_warp.reconstruction.frames.reader import FrameReader
 from beam_warp.reconstruction.frames.report import frame_line, sequence_facts, warnings_of
@@ -73,6 +74,8 @@ class ReconstructOptions:
 
     Attributes:
         segment_length: Frames from one key frame to the next; 0 for a key frame at the start only.
+        seam_frames: Frames after a planned key frame in which the segment before is tracked on and faded out, so that
+            no seam is seen; each costs the time of a tracked frame. 0 cuts.
         frames: Numbers of the frames, ascending; None for all of the split.
         cameras: ``"refine"`` corrects cameras that are beyond doubt wrong, the same in all frames; ``"keep"`` takes all
             as the capture states them.
@@ -83,6 +86,7 @@ class ReconstructOptions:
     """
 
     segment_length: int = 0
+    seam_frames: int = 2
     frames: tuple[int, ...] | None = None
     cameras: Literal["refine", "keep"] = "refine"
     masks: Literal["refine", "keep"] = "refine"
@@ -90,7 +94,8 @@ class ReconstructOptions:
 
     def __post_init__(self) -> None:
         """Check every field once."""
-        require_count("segment_length", self.segment_length, low=0)
+        for name in ("segment_length", "seam_frames"):
+            require_count(name, getattr(self, name), low=0)
         for name in ("cameras", "masks"):
             require_choice(name, getattr(self, name), ("refine", "keep"))
         require_choice("exposures", self.exposures, ("match", "keep"))
@@ -177,7 +182,7 @@ def reconstruct(
 
 @dataclass(eq=False)
 class ReconstructionWork:
-    """Steps that find the Gaussians of every frame: those of `MENDS`, ``frame`` and ``preview``.
+    """Steps that find the Gaussians of every frame: those of `MENDS`, ``frame``, ``seam`` and ``preview``.
 
     Attributes:
         capture: Images and cameras.
@@ -225,7 +230,10 @@ class ReconstructionWork:
                 inputs = first if previous is None else (frame_step(previous),)
                 rank = Rank.KEY_FRAME if previous is None else Rank.TRACKED_FRAME
                 steps.append(Step(frame_step(frame), "frame", frame, inputs, rank))
-                steps.append(Step(f"preview-{frame:06d}", "preview", frame, (frame_step(frame),), Rank.PREVIEW))
+                if frame in self.fades:
+                    goes_on = frame_step(self._before(frame)) if previous is None else seam_step(previous)
+                    steps.append(Step(seam_step(frame), "seam", frame, (goes_on,), Rank.TRACKED_FRAME))
+                steps.append(Step(f"preview-{frame:06d}", "preview", frame, self.makers(frame), Rank.PREVIEW))
         own = Plan(self.folder, tuple(steps), dict.fromkeys((step.stage for step in steps), self))
         return own.with_steps_of(self.clips.plan())
 
@@ -239,8 +247,25 @@ class ReconstructionWork:
         """Steps that write the asset of several segments; of one alone, the topology is known at the end."""
         numbers = () if self.may_be_constant else tuple(self.frames.records)
         return ClipWork(
-            self.folder, Path(ASSET_NAME).stem, self.sequence, [(frame_step(number),) for number in numbers], numbers
+            self.folder, Path(ASSET_NAME).stem, self.sequence, [self.makers(number) for number in numbers], numbers
         )
+
+    def makers(self, frame: int) -> tuple[str, ...]:
+        """Return the names of the steps that make the Gaussians of a frame."""
+        return (frame_step(frame), seam_step(frame)) if frame in self.fades else (frame_step(frame),)
+
+    @cached_property
+    def fades(self) -> dict[int, float]:
+        """Frames in which the segment before goes on, and its share."""
+        return plan_fades(self.frames.segments, self.options.seam_frames)
+
+    def _before(self, frame: int) -> int:
+        order = tuple(self.frames.records)
+        return order[order.index(frame) - 1]
+
+    def _fading(self, frame: int) -> tuple[Path, float] | None:
+        """Return what is laid over a frame; see `stored_cloud`."""
+        return (self.seams.path(frame), self.fades[frame]) if frame in self.fades else None
 
     @property
     def device_kind(self) -> str:
@@ -251,6 +276,11 @@ class ReconstructionWork:
     def store(self) -> FrameStore:
         """The files of frames and previews."""
         return FrameStore(self.folder)
+
+    @cached_property
+    def seams(self) -> FrameStore:
+        """The files of frames as the segment before goes on to show them."""
+        return FrameStore(self.folder, "seam")
 
     @cached_property
     def mends(self) -> tuple[Mend, ...]:
@@ -278,10 +308,12 @@ class ReconstructionWork:
         return common_inputs(self.steps, self.device_kind)
 
     def digest(self, step: Step) -> str:
-        """Return the digest of a frame's records and images; a preview has those of its frame."""
+        """Return the digest of a frame's records and images, and of its share; a preview has those of its frame."""
         if step.frame is None:
             with FrameReader(self.frames.records, self.store.digests) as reader:
                 return reader.digest(next(iter(self.frames.records)))
+        if step.stage == "seam":
+            return f"{self.fades[step.frame]} {self._images().digest(step.frame)}"
         return self._images().digest(step.frame) if step.stage == "frame" else ""
 
     def outputs(self, step: Step) -> tuple[Path, ...]:
@@ -290,7 +322,8 @@ class ReconstructionWork:
             return tuple(
                 path for mend in MENDS if mend.stage == step.stage and (path := self.folder / mend.kind.FILE).is_file()
             )
-        return ((self.store.path if step.stage == "frame" else self.store.preview_path)(step.frame),)
+        kinds = {"frame": self.store.path, "seam": self.seams.path, "preview": self.store.preview_path}
+        return (kinds[step.stage](step.frame),)
 
     def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
         """Find what is wrong with the capture, model a frame, or draw its preview."""
@@ -305,7 +338,7 @@ class ReconstructionWork:
         views = self._images().views(step.frame)
         self._latest = step.frame, views
         for following in task.following:
-            if following.stage == "frame" and following.frame is not None:
+            if following.stage in ("frame", "seam") and following.frame is not None:
                 self._images().expect(following.frame)
                 break
         return self._model(step, views, progress)
@@ -342,22 +375,28 @@ class ReconstructionWork:
         return {}
 
     def _model(self, step: Step, views: Sequence[CapturedView], progress: NotedProgress) -> dict[str, Any]:
-        """Fit or track a frame and store it."""
+        """Fit or track a frame and store it; what is lost after a segment's end stays so."""
         assert step.frame is not None
-        before = None
+        before, lost, is_seam = None, "", step.stage == "seam"
         if step.rank == Rank.TRACKED_FRAME:
-            order = tuple(self.frames.records)
-            previous = order[order.index(step.frame) - 1]
-            track = self.steps.restore(self.store.track_arrays(previous))
-            before = track, int(self.store.report(previous)["segment"])
-        model = model_frame(self.steps, step.frame, views, before, progress)
+            previous = self._before(step.frame)
+            store = self.seams if seam_step(previous) in step.inputs else self.store
+            said = store.report(previous)
+            before = self.steps.restore(store.track_arrays(previous)), int(said["segment"])
+            lost = said["lost"] if store is self.seams else ""
+        model = model_frame(self.steps, step.frame, views, before, progress, is_refitted=not is_seam)
+        if is_seam:
+            model.report["lost"] = lost or model.report["lost"]
+            self.seams.write(step.frame, model)
+            return {}
         self.store.write(step.frame, model)
         return {"line": frame_line(model.report), "report": model.report}
 
     def _preview(self, frame: int) -> NDArray[np.uint8]:
         """Draw the preview of a stored frame; its images are read again where they are not at hand."""
         records, raster = self.records[frame], self.steps.raster
-        cloud, cameras = stored_cloud(self.store.path(frame)), [record.camera for record in records]
+        cloud = stored_cloud(self.store.path(frame), self._fading(frame))
+        cameras = [record.camera for record in records]
         chosen, device = opposite_cameras(cameras), str(resolve_device(self.steps.device))
         views = self._latest[1] if self._latest is not None and self._latest[0] == frame else None
         return reconstruction_preview(
@@ -377,6 +416,7 @@ class ReconstructionWork:
             self.capture.frames_per_second or 30.0,
             {**(self.steps.raster or RasterOptions()).as_metadata(), **capture_frames_metadata(frames)},
             is_constant if self.may_be_constant else False,
+            {place: fading for place, frame in enumerate(frames) if (fading := self._fading(frame)) is not None},
         )
 
     def seen(self) -> Capture:
@@ -421,6 +461,7 @@ class ReconstructionWork:
             "options": {
                 **self.steps.options(),
                 "segment_length": self.options.segment_length,
+                "seam_frames": self.options.seam_frames,
                 **{mend.stage: getattr(self.options, mend.stage) for mend in MENDS},
             },
             "resumed_frames": sum(receipt.is_kept for receipt in made.values()),
@@ -435,6 +476,11 @@ class ReconstructionWork:
 def frame_step(frame: int) -> str:
     """Return the name of the step that finds the Gaussians of a frame."""
     return f"frame-{frame:06d}"
+
+
+def seam_step(frame: int) -> str:
+    """Return the name of the step that tracks the segment before into a frame."""
+    return f"seam-{frame:06d}"
 
 
 def _why_kept(records: Mapping[int, Sequence[CaptureRecord]]) -> Finding:

@@ -13,7 +13,7 @@ from beam_warp.outputs import replacing
 from beam_warp.plan.carry import carry_out
 from beam_warp.plan.steps import Plan, Step
 from beam_warp.plan.workers import InProcess
-from beam_warp.schema.writer import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER
+from beam_warp.schema.clips import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER
 from beam_warp.world.gaussians import GaussianSequence
 
 COUNT = MAX_FRAMES_IN_ONE_LAYER + CLIP_FRAMES // 2

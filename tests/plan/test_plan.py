@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -50,6 +51,16 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     here(toy_plan(folder))
     return outputs(folder)
+
+
+def test_what_steps_say_is_not_kept_in_memory(tmp_path):
+    plan, said = toy_plan(tmp_path, 50, said=100_000), 100_000
+    tracemalloc.start()
+    receipts = here(plan)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 0.2 * len(receipts) * said
+    assert len(receipts["frame-7"].facts["said"]) == said
 
 
 class TestOrder:

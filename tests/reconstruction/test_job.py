@@ -9,6 +9,7 @@ import sys
 import time
 import weakref
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,10 @@ from beam_warp.errors import InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.jobs.store import read_frame
 from beam_warp.plan import steps as plan_steps
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.reconstruction import job as job_module
 from beam_warp.reconstruction.frames import store as frame_store
-from beam_warp.reconstruction.frames.plan import plan_segments
+from beam_warp.reconstruction.frames.plan import plan_fades, plan_segments
 from beam_warp.reconstruction.frames.store import ID_BITS, stored_cloud
 from beam_warp.reconstruction.job import ReconstructOptions, reconstruct
 
@@ -83,8 +85,19 @@ def require_same_results(one, other):
     assert not [name for name in first if first[name] != second[name]]
 
 
+def drawn(cloud, camera):
+    buffer = rasterize(cloud, camera, channels=("radiance",), device="cpu")
+    return np.concatenate([buffer.channels["radiance"] * buffer.alpha[..., None], buffer.alpha[..., None]], axis=-1)
+
+
+def rms(after, before):
+    return float(np.sqrt(np.mean(np.square(np.subtract(after, before)))))
+
+
 class TestSegments:
     def test_plan(self):
+        assert plan_fades(((0, 1), (2, 3, 4), (5,)), 2) == pytest.approx({2: 2 / 3, 3: 1 / 3, 5: 1 / 2})
+        assert not plan_fades(((0, 1), (2, 3)), 0)
         assert plan_segments((3, 4, 6, 9, 10), 2) == ((3, 4), (6, 9), (10,))
         assert plan_segments((3, 4, 6), 3) == plan_segments((3, 4, 6), 0) == ((3, 4, 6),)
 
@@ -101,13 +114,33 @@ class TestSegments:
 
     def test_segments_share_no_identity(self, paired):
         steps, _, found = paired
-        assert steps.calls == ["begin", "advance", "begin", "advance"]
+        assert steps.calls == ["begin", "advance", *["advance"] * 2, "begin", "advance"]  # of them, 2 and 3 go on
         assert found.sequence.topology == "perFrame"
         assert found.report["segments"] == [0, 2]
         ids = [cloud.ids for cloud in found.sequence]
         assert np.array_equal(ids[0], ids[1])
         assert np.array_equal(ids[2], ids[3])
-        assert np.array_equal(ids[2], ids[0] + (2 << ID_BITS))
+        assert np.array_equal(ids[2], np.concatenate([ids[0] + (2 << ID_BITS), ids[0]]))  # and the faded ones
+
+    def test_seams_are_faded(self, capture, paired, tmp_path):
+        """Colours and places of a key frame are others than those before; what is seen of it comes by equal steps."""
+        cut = reconstruct(capture, tmp_path / "cut", FakeSteps(), replace(PAIRS, seam_frames=0)).sequence
+        seen = {}
+        for name, sequence in {"cut": cut, "faded": paired[2].sequence}.items():
+            cameras = [record.camera for record in capture.records if record.frame == 0]
+            seen[name] = [[drawn(cloud, camera) for camera in cameras] for cloud in sequence]
+        flicker = {name: [rms(after, before) for before, after in pairwise(frames)] for name, frames in seen.items()}
+        assert flicker["cut"][1] > 10.0 * flicker["cut"][0]  # a seam that is seen
+        assert max(flicker["faded"]) < 0.5 * max(flicker["cut"])
+        coverage = [np.mean([image[..., 3] for image in views]) for views in seen["faded"]]
+        assert np.ptp(coverage) < 0.02 * coverage[0]
+
+    def test_a_segment_that_is_lost_beyond_its_end_is_cut(self, tmp_path):
+        levels = {2: 0.95}
+        capture = Capture.read(write_capture(tmp_path / "capture", FRAMES, levels=levels))
+        found = reconstruct(capture, tmp_path / "out", FakeSteps(), PAIRS)
+        assert [len(cloud) for cloud in found.sequence] == [60, 60, 65, 65]
+        assert not any(entry["lost"] for entry in found.report["frames"])
 
     def test_a_lost_frame_is_a_key_frame_and_said_so(self, tmp_path):
         capture = Capture.read(write_capture(tmp_path / "capture", FRAMES, levels={2: 0.95}))
@@ -232,14 +265,14 @@ class TestResuming:
             before_each_write(patch, keep_what_a_kill_leaves)
             reconstruct(capture, tmp_path / "whole", FakeSteps(), options)
         keep_what_a_kill_leaves()
-        # three receipts of mends, four writes of each frame, the report, and nothing that is killed
-        assert len(left) == 3 + 4 * 3 + 1 + 1
+        # three receipts of mends, four writes of each frame, two of a seam, the report, and nothing that is killed
+        assert len(left) == 3 + 4 * 3 + 2 + 1 + 1
         for done, out in enumerate(left):
             leave_half_written(out)
             steps = FakeSteps()
             found = reconstruct(capture, out, steps, options)
-            assert len(steps.calls) == 3 - found.report["resumed_frames"]
-            assert found.report["resumed_frames"] == min(max(done - 1, 0) // 4, 3)
+            kept = found.report["resumed_frames"] + (done >= 3 + 4 * 2 + 2)  # the seam is made before its frame
+            assert len(steps.calls) == 3 + 1 - kept
             require_same_results(tmp_path / "whole", out)
 
     def test_an_interrupt_changes_no_byte_either(self, followed, capture, tmp_path, monkeypatch):
@@ -309,7 +342,8 @@ class TestStaleness:
     def test_other_segments_keep_what_they_may(self, continued, capture):
         steps = FakeSteps()
         reconstruct(capture, continued, steps, PAIRS)
-        assert steps.calls == ["begin", "advance"]  # 0 and 1 are as they were; 2 is a key frame now, and 3 follows it
+        # 0 and 1 are as they were and go on in 2 and 3; 2 is a key frame now, and 3 follows it.
+        assert steps.calls == ["advance", "advance", "begin", "advance"]
 
     def test_an_image_that_changes_costs_its_frame_and_those_after_it(self, tmp_path):
         folder = write_capture(tmp_path / "capture", (0, 1, 2))

@@ -18,6 +18,7 @@ class ToyWork:
     folder: Path
     seconds: float = 0.0
     options: str = ""
+    said: int = 0
     faults: dict = field(default_factory=dict)
 
     def common(self):
@@ -45,7 +46,7 @@ class ToyWork:
                 temporary.write_bytes(digest.digest())
                 time.sleep(self.seconds)  # whoever is killed leaves half an output
                 temporary.write_bytes(digest.digest() * 100)
-        return {"frame": step.frame}
+        return {"frame": step.frame, "said": "." * self.said}
 
     def fault(self, step):
         """Fail in the way that is asked for; with ``once``, at the first call only."""

@@ -36,6 +36,8 @@ def model_frame(
     views: Sequence[CapturedView],
     previous: tuple[FrameTrack, int] | None,
     progress: NotedProgress,
+    *,
+    is_refitted: bool = True,
 ) -> FrameModel:
     """Find the Gaussians of a frame; a frame in which tracking is lost is fitted as a key frame.
 
@@ -45,6 +47,7 @@ def model_frame(
         views: Its images.
         previous: Track of the frame before, and the key frame of its segment; None for a key frame.
         progress: Called with (stage, done, total, note), the stages "track" and "fit".
+        is_refitted: Whether a frame in which tracking is lost is fitted; else it is returned as it is, and said lost.
     """
     lost, segment = "", frame
     track, report = None, {}
@@ -54,7 +57,7 @@ def model_frame(
         track, report = steps.advance(before, views, within(progress, "track", frame))
         lost = str(report.get("lost", ""))
         findings = list(report.get("findings", []))
-    if track is None or lost:
+    if track is None or (lost and is_refitted):
         track, report = steps.begin(views, within(progress, "fit", frame))
         findings += [finding for finding in report.get("findings", []) if finding not in findings]
         segment = frame

@@ -58,6 +58,20 @@ def plan_segments(frames: Sequence[int], length: int) -> tuple[tuple[int, ...], 
     return tuple(tuple(frames[start : start + step]) for start in range(0, len(frames), step))
 
 
+def plan_fades(segments: Sequence[Sequence[int]], length: int) -> dict[int, float]:
+    """Return the frames after each seam in which the segment before goes on, and its share in each of them.
+
+    A new key frame has other errors than the frame before it, which would flicker; so one segment is faded into the
+    next, by equal steps.
+
+    Args:
+        segments: Numbers of the frames of each segment.
+        length: Most frames that a fade takes.
+    """
+    after = (segment[:length] for segment in segments[1:])
+    return {frame: 1.0 - place / (len(faded) + 1) for faded in after for place, frame in enumerate(faded, 1)}
+
+
 def _selected(capture: Capture, frames: Sequence[int] | None) -> Capture:
     """Return the capture with no other records than the training records of the frames that are asked for."""
     there = sorted({record.frame for record in capture.select(split=SPLIT)})

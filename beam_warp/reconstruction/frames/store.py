@@ -40,9 +40,9 @@ class FrameStore:
         digests: Digests of the capture's files, which are read again only if they changed.
     """
 
-    def __init__(self, out: Path) -> None:
-        """Take the folder ``out``, and ``frames``, ``previews`` and ``digests`` in it."""
-        self._out = out
+    def __init__(self, out: Path, stem: str = "frame") -> None:
+        """Take the folder ``out``, and ``frames``, ``previews`` and ``digests`` in it; files begin with ``stem``."""
+        self._out, self._stem = out, stem
         self._folders = [out / name for name in FOLDERS]
         self.digests = CaptureDigests(self._folders[2])
 
@@ -56,7 +56,7 @@ class FrameStore:
 
     def path(self, frame: int) -> Path:
         """Return the file of a frame."""
-        return self._folders[0] / f"frame_{frame:06d}.h5"
+        return self._folders[0] / f"{self._stem}_{frame:06d}.h5"
 
     def preview_path(self, frame: int) -> Path:
         """Return the file of a frame's preview."""
@@ -82,7 +82,7 @@ class FrameStore:
 
     def report(self, frame: int) -> dict[str, Any]:
         """Read the report of a frame; see `FrameModel`."""
-        return json.loads(read_frame(self.path(frame), (HEADER,))[HEADER].tobytes())["report"]
+        return _header(self.path(frame))["report"]
 
     def track_arrays(self, frame: int) -> dict[str, NDArray[Any]]:
         """Read the arrays of a frame's track."""
@@ -97,6 +97,7 @@ def stored_sequence(
     frames_per_second: float,
     stated: Mapping[str, str] = MappingProxyType({}),
     is_constant: bool | None = None,
+    fading: Mapping[int, tuple[Path, float]] = MappingProxyType({}),
 ) -> GaussianSequence:
     """Return frames of the store as a sequence; they are read when they are asked for.
 
@@ -108,11 +109,12 @@ def stored_sequence(
         stated: Further metadata: how the Gaussians were drawn, which frames of the capture they show (see
             `beam_warp.world.metadata`).
         is_constant: Whether the topology is constant, where that is known without reading all frames.
+        fading: What is laid over some frames, by their place; see `stored_cloud`.
     """
     constant = _has_same_rows(paths) if is_constant is None else is_constant
     return GaussianSequence(
         frame_count=len(paths),
-        read_frame=lambda frame: stored_cloud(paths[frame]),
+        read_frame=lambda frame: stored_cloud(paths[frame], fading.get(frame)),
         frames_per_second=frames_per_second,
         constant=frozenset({"ids"}) if constant else frozenset(),
         topology="constant" if constant else "perFrame",
@@ -130,10 +132,28 @@ def _has_same_rows(paths: Sequence[Path]) -> bool:
     return all(np.array_equal(read_frame(path, ("ids",))["ids"], ids) for path in paths[1:])
 
 
-def stored_cloud(path: Path) -> GaussianCloud:
-    """Read the Gaussians of a frame of the store."""
+def stored_cloud(path: Path, fading: tuple[Path, float] | None = None) -> GaussianCloud:
+    """Read the Gaussians of a frame of the store.
+
+    Opacities of two overlaid models of a surface add up to those of one: each is multiplied by its share.
+
+    Args:
+        path: File of the frame.
+        fading: File of the same frame as the segment before goes on to show it, and its share in (0, 1); its Gaussians
+            are the last rows. It is left out where tracking was lost.
+    """
     names = tuple(name for name in frame_names(path) if name in ATTRIBUTES)
-    return GaussianCloud(**read_frame(path, names), axes=WORLD_AXES, radiance_color_space=LINEAR_REC709)
+    arrays: dict[str, NDArray[Any]] = read_frame(path, names)
+    if fading is not None and not _header(fading[0])["report"]["lost"]:
+        before, share = read_frame(fading[0], names), np.float32(fading[1])
+        before["opacities"] = before["opacities"] * share
+        arrays["opacities"] = arrays["opacities"] * (1 - share)
+        arrays = {name: np.concatenate([arrays[name], before[name]]) for name in names}
+    return GaussianCloud(**arrays, axes=WORLD_AXES, radiance_color_space=LINEAR_REC709)
+
+
+def _header(path: Path) -> dict[str, Any]:
+    return json.loads(read_frame(path, (HEADER,))[HEADER].tobytes())
 
 
 def common_inputs(steps: FrameSteps, device_kind: str) -> str:
