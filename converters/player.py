@@ -6,7 +6,7 @@ import base64
 import html
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,9 @@ MAX_EMBEDDED = 2**28
 
 ENVIRONMENT_ROWS = 128
 """Most rows of an environment in a page: 1.4 degrees, finer than what but the glossiest surfaces show."""
+
+SERVED = ("live", "stills")
+"""Modules of pages that a server stands behind, which packs the take and draws stills."""
 
 _IMPORT = re.compile(r"""((?:from|import)\s*\(?\s*["'])\./([\w-]+\.js)(?=["'])""")
 _CHUNK = 3 * 2**18
@@ -82,7 +85,7 @@ def write_player(
             file.write('<script type="text/plain" id="take">')
             file.writelines(map(_encoded, _chunks(take)))
             file.write("</script>\n")
-        file.write(_SCRIPT)
+        file.write(_script())
     return [beside, path] if is_beside else [path]
 
 
@@ -93,13 +96,16 @@ def page_text(title: str, settings: Mapping[str, Any]) -> str:
         title: What the page is called.
         settings: What ``engines/web/player.js`` reads.
     """
-    return _head(title, settings) + _SCRIPT
+    return _head(title, settings, SERVED) + _script(SERVED)
 
 
-def modules(first: str = "player.js") -> dict[str, str]:
-    """Return the texts of a module and of all that it imports, by file name; imports name `MODULES`."""
+def modules(more: Iterable[str] = ()) -> dict[str, str]:
+    """Return the texts of the player, of more modules, and of all that they import, by file name.
+
+    Imports name `MODULES`.
+    """
     found: dict[str, str] = {}
-    wanted = [first]
+    wanted = ["player.js", *(f"{name}.js" for name in more)]
     while wanted:
         name = wanted.pop()
         if name not in found:
@@ -113,11 +119,11 @@ def _source(name: str) -> str:
     return files("beam_warp.web").joinpath(name).read_text(encoding="utf-8")
 
 
-def _head(title: str, settings: Mapping[str, Any]) -> str:
+def _head(title: str, settings: Mapping[str, Any], more: Iterable[str] = ()) -> str:
     """Return a page up to its take."""
     addresses = {
         f"{MODULES}/{name}": f"data:text/javascript;base64,{_encoded(text.encode())}"
-        for name, text in modules().items()
+        for name, text in modules(more).items()
     }
     # "<" is escaped, so that no text in the data can end the element that holds it
     data = json.dumps(settings, allow_nan=False).replace("<", "\\u003c")
@@ -133,9 +139,13 @@ def _head(title: str, settings: Mapping[str, Any]) -> str:
     )
 
 
-_SCRIPT = f"""<script type="module">
+def _script(more: Iterable[str] = ()) -> str:
+    """Return the end of a page: it starts the player, and hands it more modules by name."""
+    imports = [f'import * as {name} from "{MODULES}/{name}.js";\n' for name in more]
+    return f"""<script type="module">
 import {{start}} from "{MODULES}/player.js";
-start(document.getElementById("player"), JSON.parse(document.getElementById("settings").textContent));
+{"".join(imports)}const settings = JSON.parse(document.getElementById("settings").textContent);
+start(document.getElementById("player"), settings, {{{", ".join(more)}}});
 </script>
 </body>
 </html>

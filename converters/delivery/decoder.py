@@ -52,14 +52,6 @@ class Component:
     summed: Float32  # (S, N), the first planes, which all frames use
     plain: list[NDArray[np.signedinteger]]  # the others, P of (N,); most have a weight in one frame only
 
-    def at(self, frame: int) -> Float32:
-        """Return the numbers at a frame of the block, ``(N,)``."""
-        offset, first, last = np.split(self.weights[frame], [1, 1 + len(self.summed)])
-        values = first @ self.summed + offset
-        for plane in np.flatnonzero(last):
-            values += self.plain[plane] * last[plane]
-        return values
-
 
 class Container:
     """A container that is open for reading: a ``.b4d`` file, a folder, or the manifest in it.
@@ -82,7 +74,7 @@ class Container:
         _check(self.manifest)
         tracks = self.tracks(self.manifest["static"], 1)
         _require(tracks.keys() >= REQUIRED, f"the static block must hold {', '.join(sorted(REQUIRED))}", sorted(tracks))
-        self._raw = {name: np.stack([each.at(0) for each in track]) for name, track in tracks.items()}
+        self._raw = {name: _values(track, 0) for name, track in tracks.items()}
         self.still: Arrays = {name: activated(name, values) for name, values in self._raw.items()}
         self._unpacked = -1, dict[str, Track]()
 
@@ -131,15 +123,14 @@ class Container:
             tracks = self.tracks(segments[index], segments[index]["frames"])
             self._unpacked = index, tracks
         at = number - segments[index]["first"]
-        raw = {name: np.stack([each.at(at) for each in track]) for name, track in tracks.items()}
+        raw = {name: _values(track, at) for name, track in tracks.items()}
         for name in raw.keys() & self._raw.keys():
             raw[name] += self._raw[name]
         turn = quaternions(raw.pop("turns")) if "turns" in raw else None
         arrays = self.still | {name: activated(name, values) for name, values in raw.items()}
-        if turn is not None:
-            arrays["orientations"] = product(turn, arrays["orientations"])
-            if "normals" in arrays:
-                arrays["normals"] = rotated(turn, arrays["normals"])
+        for name, turned in (("orientations", product), ("normals", rotated)):
+            if turn is not None and name in arrays:
+                arrays[name] = turned(turn, arrays[name])
         return arrays
 
 
@@ -202,7 +193,18 @@ def _plane(content: bytes, at: int, count: int, size: int) -> NDArray[np.signedi
     numbers, one = octets[0].astype(kind), np.array(1, kind)
     for order in range(1, size):
         numbers |= octets[order].astype(kind) << np.array(8 * order, kind)
-    return ((numbers >> one) ^ (~(numbers & one) + one)).view(f"i{kind.itemsize}")
+    return ((numbers >> one) ^ -(numbers & one)).view(f"i{kind.itemsize}")
+
+
+def _values(track: Track, frame: int) -> Float32:
+    values = np.empty((len(track), track[0].summed.shape[1]), np.float32)
+    for component, row in zip(track, values, strict=True):
+        offset, first, last = np.split(component.weights[frame], [1, 1 + len(component.summed)])
+        np.einsum("s,sn->n", first, component.summed, out=row)  # of few rows, faster than a product of matrices
+        row += offset
+        for plane in np.flatnonzero(last):
+            row += component.plain[plane] * last[plane]
+    return values
 
 
 def activated(name: str, values: Float32) -> Float32:
@@ -218,9 +220,8 @@ def activated(name: str, values: Float32) -> Float32:
 
 def quaternions(rodrigues: Float32) -> Float32:
     """Return the unit quaternions xyzw of modified Rodrigues parameters, axis times tan(angle / 4)."""
-    square = np.einsum("cn,cn->n", rodrigues, rodrigues)
-    share = np.float32(1.0) / (np.float32(1.0) + square)
-    return np.concatenate([rodrigues * (share + share), ((np.float32(1.0) - square) * share)[None]])
+    share = np.float32(2.0) / (np.float32(1.0) + np.einsum("cn,cn->n", rodrigues, rodrigues))
+    return np.concatenate([rodrigues * share, (share - np.float32(1.0))[None]])
 
 
 def product(left: Float32, right: Float32) -> Float32:

@@ -100,10 +100,9 @@ export class Take {
   /** Return a frame of a segment whose tracks are at hand; arrays that do not change are shared between frames. */
   frameOf(tracks, frame) {
     const count = this.manifest.count, found = {...this.still};
-    const values = mapped(tracks, (track, name) => valuesAt(track, frame, count, this.raw[name]));
-    for (const name of Object.keys(values)) if (name !== "turns") found[name] = activated(name, values[name]);
-    if (values.turns) turn(found, values.turns, count);
-    return found;
+    const {turns, ...values} = mapped(tracks, (track, name) => valuesAt(track, frame, count, this.raw[name]));
+    for (const name of Object.keys(values)) found[name] = turns && name === "normals" ? values[name] : activated(name, values[name]);
+    return turns ? turn(found, turns, count, values.normals) : found;
   }
 }
 
@@ -130,18 +129,25 @@ function check(said) {
 export function unpacking() {
   const must = (condition, contract, got) => { if (!condition) throw new Error(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
-  /** Return the whole numbers of a plane: 0, 1, 2, 3, 4 … stand for 0, -1, 1, -2, 2 …. Loops that meet one kind of array are fast. */
+  /** Put 0, -1, 1, -2, 2 … where octets 0, 1, 2, 3, 4 … stand: four at a time, but for those before and after whole words. */
+  function signed({buffer, byteOffset, length}) {
+    const head = Math.min(-byteOffset & 3, length), tail = length - ((length - head) & 3), numbers = new Int8Array(buffer, byteOffset, length);
+    const words = new Uint32Array(buffer, byteOffset + head, (tail - head) / 4);
+    for (let k = 0; k < words.length; k++) words[k] = ((words[k] >>> 1) & 0x7f7f7f7f) ^ (255 * (words[k] & 0x01010101));
+    for (let i = head ? 0 : tail; i < length; i = i + 1 === head ? tail : i + 1) numbers[i] = ((numbers[i] & 255) >>> 1) ^ -(numbers[i] & 1);
+    return numbers;
+  }
+
+  /** Return the whole numbers of a plane, in its own place if they are octets. Loops that meet one kind of array are fast. */
   function plane(octets, count, size, isSummed) {
-    if (size === 1 && !isSummed) { // four at a time
-      const words = new Uint32Array(Math.ceil(count / 4));
-      new Uint8Array(words.buffer).set(octets);
-      for (let k = 0; k < words.length; k++) words[k] = ((words[k] >>> 1) & 0x7f7f7f7f) ^ (255 * (words[k] & 0x01010101));
-      return new Int8Array(words.buffer, 0, count);
-    }
-    const [a, b, c, d] = [0, 1, 2, 3].map((k) => (k < size ? octets.subarray(k * count) : new Uint8Array(count)));
+    if (size === 1 && !isSummed) return signed(octets);
+    const [a, b, c, d] = [0, 1, 2, 3].map((k) => octets.subarray(k < size ? k * count : 0)), [m, n, o] = [2, 3, 4].map((k) => (k <= size ? -1 : 0));
     const numbers = new Float32Array(count), kept = isSummed ? -1 : 0; // all bits of the sum so far, or none
-    for (let i = 0, sum = 0; i < count; i++) {
-      const code = a[i] | b[i] << 8 | c[i] << 16 | d[i] << 24;
+    if (size < 3) for (let i = 0, sum = 0; i < count; i++) {
+      const code = a[i] | b[i] << 8 & m;
+      numbers[i] = sum = ((sum & kept) + ((code >>> 1) ^ -(code & 1))) | 0;
+    } else for (let i = 0, sum = 0; i < count; i++) {
+      const code = a[i] | b[i] << 8 | c[i] << 16 & n | d[i] << 24 & o;
       numbers[i] = sum = ((sum & kept) + ((code >>> 1) ^ -(code & 1))) | 0;
     }
     return numbers;
@@ -163,23 +169,25 @@ export function unpacking() {
       return plane(content.subarray(at, at += size * count), count, size, k < component.first);
     });
     must(at === content.length, "it must be filled by its planes", at);
-    return {tracks, transfer: components.flatMap(({planes}) => planes.map(({buffer}) => buffer))};
+    return {tracks, transfer: [...new Set(components.flatMap(({planes}) => planes.map(({buffer}) => buffer)))]};
+  }
+
+  /** Return what a stream unpacks to; an error if it is damaged, or not as long as it should be. */
+  async function inflated(packed, size) {
+    const stream = new DecompressionStream("deflate"), writer = stream.writable.getWriter(), reader = stream.readable.getReader(), content = new Uint8Array(size);
+    Promise.all([writer.write(packed), writer.close()]).catch(() => {}); // the reader meets it too
+    let end = 0;
+    for (let part; !(part = await reader.read()).done; end += part.value.length) content.set(part.value, end);
+    return end === size ? content : new Error(`${end}`);
   }
 
   return async ({packed, entry: {file, bytes, unpacked, sha256}, frames, count}) => {
     must(packed.length === bytes, `${file} must have ${bytes} bytes`, packed.length);
-    if (globalThis.crypto?.subtle) { // pages from http have none
-      const digits = Array.from(new Uint8Array(await crypto.subtle.digest("SHA-256", packed)), (byte) => byte.toString(16).padStart(2, "0")).join("");
-      must(digits === sha256, `${file} must have the digest that the manifest says`, digits);
-    }
-    const reader = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate")).getReader(), content = new Uint8Array(unpacked);
-    let end = 0;
-    try {
-      for (let part; !(part = await reader.read()).done; end += part.value.length) content.set(part.value, end);
-    } catch (error) { // a damaged stream, or more than the manifest says
-      throw new Error(`${file} must unpack to ${unpacked} bytes, got ${error.message}.`);
-    }
-    must(end === unpacked, `${file} must unpack to ${unpacked} bytes`, end);
+    const digest = globalThis.crypto?.subtle?.digest("SHA-256", packed); // pages from http have none
+    const content = await inflated(packed, unpacked).catch((error) => error);
+    const digits = digest && Array.from(new Uint8Array(await digest), (byte) => byte.toString(16).padStart(2, "0")).join("");
+    must(!digest || digits === sha256, `${file} must have the digest that the manifest says`, digits);
+    must(content instanceof Uint8Array, `${file} must unpack to ${unpacked} bytes`, content.message);
     try {
       return split(content, frames, count);
     } catch (error) {
@@ -190,22 +198,23 @@ export function unpacking() {
 
 /** Return offset plus weights times planes for each component, plus what the static block says. */
 function valuesAt(track, frame, count, start) {
-  const values = new Float32Array(track.length * count);
+  const values = new Float32Array(track.length * count), none = new Int8Array(count);
   track.forEach(({columns, weights, planes}, c) => {
-    const part = (all) => all.subarray(c * count, (c + 1) * count), out = part(values);
-    const row = weights.subarray(frame * columns, (frame + 1) * columns), isWide = ([numbers]) => numbers instanceof Float32Array;
-    const used = planes.map((numbers, k) => [numbers, row[1 + k]]).filter(([, weight]) => weight), wide = used.filter(isWide);
-    for (let n = 0; n < Math.max(wide.length, 1); n += 4) {
-      const [[a, p], [b, q], [d, r], [e, s]] = [0, 1, 2, 3].map((k) => wide[n + k] ?? [out, 0]);
-      blend(out, n || !start ? out : part(start), n ? 0 : row[0], a, b, d, e, p, q, r, s);
+    const part = (all) => all.subarray(c * count, (c + 1) * count), out = part(values), at = frame * columns;
+    const used = planes.map((numbers, k) => [numbers, weights[at + 1 + k]]).filter(([, weight]) => weight);
+    const [wide, octets] = [Float32Array, Int8Array].map((kind) => used.filter(([numbers]) => numbers instanceof kind));
+    if (start) wide.unshift([part(start), 1]);
+    for (let offset = weights[at], isFirst = true; isFirst || wide.length || octets.length; offset = 0, isFirst = false) {
+      if (!isFirst) wide.unshift([out, 1]);
+      const [add, most] = wide.length > 2 ? [addFour, 4] : [addTwo, 2];
+      add(out, offset, ...(octets.shift() ?? [none, 0]), ...Array.from({length: most}, () => wide.shift() ?? [out, 0]).flat());
     }
-    for (const [numbers, weight] of used) if (!isWide([numbers])) addOctets(out, numbers, weight);
   });
   return values;
 }
 
-const blend = (out, from, offset, a, b, c, d, p, q, r, s) => { for (let i = 0; i < out.length; i++) out[i] = from[i] + offset + p * a[i] + q * b[i] + r * c[i] + s * d[i]; };
-const addOctets = (out, numbers, weight) => { for (let i = 0; i < out.length; i++) out[i] += weight * numbers[i]; };
+const addTwo = (out, offset, o, w, a, p, b, q) => { for (let i = 0; i < out.length; i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i]; };
+const addFour = (out, offset, o, w, a, p, b, q, c, r, d, s) => { for (let i = 0; i < out.length; i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i] + r * c[i] + s * d[i]; };
 
 /** Turn numbers of an array into what they stand for, in place where that is possible. */
 function activated(name, values) {
@@ -234,18 +243,18 @@ function quaternions(values, count) {
   return found;
 }
 
-/** Turn orientations, and normals where there are any, by modified Rodrigues parameters. */
-function turn(arrays, turns, count) {
-  const from = arrays.orientations, to = new Float32Array(4 * count), normals = arrays.normals, turned = normals && new Float32Array(3 * count);
+/** Turn orientations, and normals where there are any, by modified Rodrigues parameters; normals may have any length (`own`: in place). */
+function turn(arrays, turns, count, own) {
+  const from = arrays.orientations, to = new Float32Array(4 * count), normals = arrays.normals, turned = own ?? (normals && new Float32Array(3 * count));
   for (let i = 0, j = count, k = 2 * count, l = 3 * count; i < count; i++, j++, k++, l++) {
-    const s = turns[i] * turns[i] + turns[j] * turns[j] + turns[k] * turns[k], share = 1 / (1 + s);
-    const a = 2 * turns[i] * share, b = 2 * turns[j] * share, c = 2 * turns[k] * share, d = (1 - s) * share, x = from[i], y = from[j], z = from[k], w = from[l];
+    const e = turns[i], f = turns[j], g = turns[k], s = e * e + f * f + g * g, share = 1 / (1 + s), two = share + share;
+    const a = e * two, b = f * two, c = g * two, d = (1 - s) * share, x = from[i], y = from[j], z = from[k], w = from[l];
     to[i] = d * x + a * w + b * z - c * y, to[j] = d * y + b * w + c * x - a * z;
     to[k] = d * z + c * w + a * y - b * x, to[l] = d * w - a * x - b * y - c * z;
     if (!normals) continue;
-    const u = normals[i], v = normals[j], n = normals[k], p = 2 * (b * n - c * v), q = 2 * (c * u - a * n), r = 2 * (a * v - b * u);
-    turned[i] = u + d * p + b * r - c * q, turned[j] = v + d * q + c * p - a * r, turned[k] = n + d * r + a * q - b * p;
+    const u = normals[i], v = normals[j], n = normals[k], unit = 1 / Math.max(Math.sqrt(u * u + v * v + n * n), 1e-12);
+    const p = 2 * (b * n - c * v), q = 2 * (c * u - a * n), r = 2 * (a * v - b * u);
+    turned[i] = unit * (u + d * p + b * r - c * q), turned[j] = unit * (v + d * q + c * p - a * r), turned[k] = unit * (n + d * r + a * q - b * p);
   }
-  arrays.orientations = to;
-  if (normals) arrays.normals = turned;
+  return Object.assign(arrays, {orientations: to}, normals && {normals: turned});
 }

@@ -6,10 +6,8 @@ import {Take} from "./b4d.js";
 import {download, element} from "./elements.js";
 import {Environment} from "./environment.js";
 import {Lamps, fromLight} from "./lamps.js";
-import {openLive} from "./live.js";
 import {Orbit, boundsOf, boxOf} from "./orbit.js";
 import {Relight} from "./relight.js";
-import {Stills} from "./stills.js";
 import {enterVr, hasVr} from "./vr.js";
 
 const CHANNELS = {relit: "lit", base_color: "base colour", roughness: "roughness", ambient_occlusion: "ambient occlusion",
@@ -34,9 +32,12 @@ function bytesOf(base64) {
   return bytes;
 }
 
-/** Start the player in an element; `settings` is what `converters/player.py` writes. */
-export async function start(root, settings) {
-  const player = new Player(root, settings);
+/**
+ * Start the player in an element; `settings` is what `converters/player.py` writes. A page of `beam view` hands over the modules
+ * `live.js` and `stills.js`, which other pages need not hold.
+ */
+export async function start(root, settings, {live, stills} = {}) {
+  const player = new Player(root, settings, {live, stills});
   globalThis.player = player;
   await player.begin();
   return player;
@@ -44,7 +45,7 @@ export async function start(root, settings) {
 
 /** A page's state, its controls, and the loop that draws. */
 export class Player {
-  constructor(root, settings) {
+  constructor(root, settings, {live, stills} = {}) {
     const {view = {}} = settings;
     Object.assign(this, {root, settings, shadows: SHADOWS, scale: 0, lastMove: 0, environments: new Map()});
     this.state = {playing: false, time: 0, rate: 1, loop: true, channel: "relit", environment: null, environmentShadows: 0, rotation: 0,
@@ -56,7 +57,8 @@ export class Player {
     this.status = element("p", {className: "status"});
     this.orbit = new Orbit(this.canvas, (isByHand) => this.moved(isByHand));
     this.lamps = new Lamps(this.overlay, () => this.lightsChanged());
-    this.stills = settings.stills ? new Stills(this, settings.stills) : null;
+    this.stills = settings.stills ? new stills.Stills(this, settings.stills) : null;
+    this.openTake = live?.openLive ?? Take.open;
     root.replaceChildren(this.canvas, this.stills?.image ?? "", this.overlay, this.header(), this.panel(), this.transport(), this.message);
     this.bindPage();
   }
@@ -101,7 +103,7 @@ export class Player {
   async open(source, name) {
     this.busy(true);
     try {
-      const take = await (source instanceof Blob ? Take.from(source) : this.settings.stills ? openLive(source.url) : Take.open(source.url, source.read));
+      const take = await (source instanceof Blob ? Take.from(source) : this.openTake(source.url, source.read));
       await this.relight.open(take);
       this.take = take;
       this.settled = null;
@@ -267,7 +269,7 @@ export class Player {
     if (this.isFollowing || this.part === frame) return;
     this.isFollowing = true;
     try {
-      const take = await openLive(parts.url.replace(/0(?=\.b4d$)/, frame));
+      const take = await this.openTake(parts.url.replace(/0(?=\.b4d$)/, frame));
       if (this.parts !== parts) return;
       await this.relight.open(take);
       this.take = take;

@@ -179,6 +179,7 @@ export class Relight extends EventTarget {
     this.rows = rows;
     const stored = this.#store(Object.entries(take.raw).filter(([name]) => isStored(name)).flatMap(([name, values]) =>
       Array.from({length: values.length / Math.max(count, 1)}, (_, c) => [`${name}${c}`, values.subarray(c * count, (c + 1) * count)])), "float");
+    for (const write of stored.late.values()) write();
     this.#textures.still = stored.texture;
     this.still = stored.places;
     for (const name of ["positions", "orientations", "scales", "colors", "normals"]) this.#texture(name, ROW, rows, "rgba32float");
@@ -202,27 +203,30 @@ export class Relight extends EventTarget {
     this.#evaluated = this.#casters = null;
   }
 
-  #free({summed, plain, number}) {
+  #free({summed, plain, number, late}) {
+    late.clear();
     this.gpu.destroy(summed);
     this.gpu.destroy(plain);
     this.#sorter.ask({drop: number});
   }
 
-  /** Put planes into one texture: rows of Gaussians, planes below each other, in layers. */
+  /** Make room for planes in one texture: rows of Gaussians, planes below each other, in layers. `late` says how each is written. */
   #store(planes, kind) {
-    if (!planes.length) return {texture: null, places: {}};
+    if (!planes.length) return {texture: null, places: {}, late: new Map()};
     const rows = this.rows, format = kind === "float" ? "r32float" : "r8sint", stack = Math.max(Math.floor(LAYER_ROWS / rows), 1);
     const layers = Math.ceil(planes.length / stack), height = Math.min(stack, planes.length) * rows;
     require(layers <= MAX_LAYERS, `a segment must have at most ${MAX_LAYERS * stack} planes`, planes.length);
-    const texture = this.gpu.texture({width: ROW, height, layers, format}), places = {};
+    const texture = this.gpu.texture({width: ROW, height, layers, format}), places = {}, late = new Map();
     const padded = new (kind === "float" ? Float32Array : Int8Array)(ROW * rows);
     planes.forEach(([name, values], k) => {
-      padded.set(values);
       const layer = Math.floor(k / stack), y = (k % stack) * rows;
-      this.gpu.write(texture, padded, {layer, y, height: rows});
       places[name] = [y, layer];
+      late.set(name, () => {
+        padded.set(values);
+        this.gpu.write(texture, padded, {layer, y, height: rows});
+      });
     });
-    return {texture, places};
+    return {texture, places, late};
   }
 
   /** Length of the take [s]. */
@@ -254,16 +258,32 @@ export class Relight extends EventTarget {
     return {number, local, share};
   }
 
-  /** Bring a segment to the GPU, and what it says of positions to the sorter. */
+  /** Bring a segment to the GPU, and what it says of positions to the sorter: first what all frames need, the rest when a frame needs it, or soon. */
   async #bring(number, entry, tracks) {
+    const positions = (tracks.positions ?? [[], [], []]).map(({planes = []}) => planes), isOctets = (values) => values instanceof Int8Array;
+    const told = this.#sorter.ask({segment: number, planes: positions.map((planes) => planes.map((values) => isOctets(values) ? null : values))});
     const named = Object.entries(tracks).filter(([name]) => isStored(name)).flatMap(([name, components]) =>
       components.flatMap(({planes}, c) => planes.map((values, k) => [`${name}${c}/${k}`, values])));
     const summed = this.#store(named.filter(([, values]) => values instanceof Float32Array), "float");
-    const plain = this.#store(named.filter(([, values]) => values instanceof Int8Array), "int");
+    const plain = this.#store(named.filter(([, values]) => isOctets(values)), "int"), {late} = plain;
+    for (const write of summed.late.values()) write();
+    positions.forEach((planes, c) => planes.forEach((values, k) => {
+      const name = `positions${c}/${k}`, write = late.get(name);
+      if (write) late.set(name, () => { write(); this.#sorter.ask({segment: number, plane: [c, k, values.slice()]}); });
+    }));
     const weights = mapped(tracks, (components) => components.map(({columns, weights: all}) => ({columns, weights: all})));
-    await this.#sorter.ask({segment: number, planes: (tracks.positions ?? [[], [], []]).map(({planes = []}) => planes)});
-    return {number, entry, weights, summed: summed.texture, plain: plain.texture, summedPlaces: summed.places, plainPlaces: plain.places,
+    await told;
+    this.#bringRest(late);
+    return {number, entry, weights, late, summed: summed.texture, plain: plain.texture, summedPlaces: summed.places, plainPlaces: plain.places,
       bytes: 4 * texels(summed.texture) + texels(plain.texture)};
+  }
+
+  /** Write planes that no frame has needed yet, a few at a time, so that pictures are drawn meanwhile. */
+  async #bringRest(late) {
+    for (const [name, write] of late) {
+      if (late.size % 8 === 0) await new Promise((resolve) => setTimeout(resolve));
+      if (late.delete(name)) write();
+    }
   }
 
   /** Moment that is shown [s]: that of the nearest frame at hand, while the wanted one is on its way; null before the first. */
@@ -299,6 +319,8 @@ export class Relight extends EventTarget {
             if (k === 0) offset = weight;
             else if (weight) {
               const key = `${name}${c}/${k - 1}`, isSummed = key in segment.summedPlaces;
+              const write = segment.late.get(key);
+              if (write && segment.late.delete(key)) write();
               terms.push([isSummed ? 1 : 2, ...(isSummed ? segment.summedPlaces : segment.plainPlaces)[key], weight]);
               if (name === "positions") forSorter.terms[c].push([k - 1, weight]);
             }

@@ -98,6 +98,10 @@ export function sortingWorker() {
       segments.clear();
     }
     if (message.segment !== undefined && message.planes) segments.set(message.segment, message.planes);
+    if (message.plane) {
+      const [c, k, values] = message.plane, planes = segments.get(message.segment);
+      if (planes) planes[c][k] = values;
+    }
     if (message.drop !== undefined) segments.delete(message.drop);
     if (!message.at) return null;
     evaluate(message.at);

@@ -12,7 +12,7 @@ from support.small_stages import cloud
 
 from beam_warp import converters
 from beam_warp.cli.convert import main
-from beam_warp.converters.player import ENVIRONMENT_ROWS, MODULES, modules
+from beam_warp.converters.player import ENVIRONMENT_ROWS, MODULES, SERVED, modules
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.hdr import radiance_hdr
 from beam_warp.stage.discs import SPREAD, discs_of
@@ -86,6 +86,7 @@ def test_every_module_is_there_and_found_by_name(take, tmp_path):
     assert {name for names in wanted for name in names} <= set(texts)
     assert {f"{MODULES}/{name}" for name in ("player.js", "b4d.js", "relight.js")} <= set(texts)
     assert set(modules()) == {name.removeprefix(f"{MODULES}/") for name in texts}
+    assert set(modules(SERVED)) - set(modules()) == {"live.js", "stills.js"}, "what only a server's page needs"
 
 
 def test_a_take_lies_beside_its_page(take, tmp_path):
