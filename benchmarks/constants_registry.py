@@ -72,6 +72,7 @@ class Constant:
 FIT = "beam_warp.reconstruction.fit:"
 INITIAL = "beam_warp.reconstruction.initial:"
 TRACK = "beam_warp.reconstruction.track:"
+JOINTS = "beam_warp.reconstruction.joint_tracking:"
 EVIDENCE = "beam_warp.materials.evidence:"
 ROUGHNESS = "beam_warp.materials.roughness:"
 RESIDUES = "beam_warp.kernels.materials.residues:"
@@ -160,6 +161,7 @@ RECONSTRUCTION = (
 
 TRACKING = (
     Constant(TRACK + "GAUSSIANS_PER_JOINT", WALKER, "Gaussians for each joint."),
+    Constant(JOINTS + "GAUSSIANS_PER_PIXEL", WALKER, "Gaussians for a pixel and side in reduced images."),
     Constant(TRACK + "JOINT_LIMITS", WALKER, "Fewest and most joints.", "neither limit is met with 20,000 Gaussians"),
     Constant(TRACK + "SMALLEST_COSINE", BOTH, "Cosine of normals below which neighbours are of two limbs.", most=1.0),
     Constant(TRACK + "TrackOptions.joints.levels", WALKER, "Reductions of the images, coarse to fine.", BINARY),

@@ -57,13 +57,14 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
+from beam_warp.reduction.changes import changed
 from beam_warp.reduction.job import ReduceOptions, Reducer, reduce_asset
-from beam_warp.reduction.moments import Clusters, changed, shown_area
 from beam_warp.reduction.refit import refit
 from beam_warp.study.true_surface import SHARP, surface_of_capture
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.world.axes import change_axes
+from beam_warp.world.clusters import Clusters, shown_area
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 

@@ -15,6 +15,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import upload
 from beam_warp.device.graphs import StepGraphs
+from beam_warp.device.morton import morton_order
 from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, RasterOptions
@@ -22,7 +23,12 @@ from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, shuffled_views
+from beam_warp.world.clusters import Clusters
 from beam_warp.world.gaussians import GaussianCloud
+
+GAUSSIANS_PER_PIXEL = 4
+"""Gaussians for a pixel that the subject covers in a reduced image, on each of its two sides: what is finer moves no
+pixel, and few tiles with all Gaussians in each leave most of a GPU idle."""
 
 
 @dataclass(frozen=True)
@@ -110,24 +116,16 @@ class JointTracker:
         self._options = options
         self._raster = raster
         count = len(joints)
-        self._count = len(cloud)
+        self._cloud, self._anchors, self._joints = cloud, anchors, joints
         self._spacing = graph.spacing
-        self._skin = Skin(cloud.positions, cloud.orientations, anchors, joints, blend=options.blend, device=device)
+        self._all = _Carried(cloud, anchors, joints, options.blend, device)
         self._rigidity = RigidityLoss(graph, device=device)
         at_rest = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1))
         self._rest_rotations = upload(at_rest, wp.quat, device)
         self._rotations = wp.clone(self._rest_rotations)
-        self._positions = wp.clone(self._skin.joint_rest_positions)
+        self._positions = wp.clone(self._all.skin.joint_rest_positions)
         self._rotation_gradients = wp.zeros(count, dtype=wp.quat, device=device)
         self._position_gradients = wp.zeros(count, dtype=wp.vec3, device=device)
-        self._drawn = GaussianArrays(
-            wp.clone(self._skin.rest_positions),
-            wp.clone(self._skin.rest_orientations),
-            upload(cloud.scales, wp.vec3, device),
-            upload(cloud.opacities, float, device),
-            None,
-            upload(cloud.radiance, wp.vec3, device),  # type: ignore[arg-type]
-        )
 
     def find(self, views: Sequence[CapturedView], start: JointPose, samples: int, seed: int) -> JointPose:
         """Move the joints until what they carry looks like the views.
@@ -145,7 +143,8 @@ class JointTracker:
         rates = {"rotations": chosen.rotation_rate, "positions": chosen.position_rate * self._spacing}
         for level, iterations in zip(chosen.levels, chosen.iterations, strict=True):
             reduced = [view.reduced(min(level, view.camera.width, view.camera.height)) for view in views]
-            targets = TargetSet(reduced, self._count, self._raster, samples if level == 1 else 1, self.device)
+            carried = self._all if level == 1 else self._for_views(reduced)
+            targets = TargetSet(reduced, carried.count, self._raster, samples if level == 1 else 1, self.device)
             adam = Adam(
                 {
                     "rotations": Parameters(self._rotations, self._rotation_gradients, rates["rotations"]),
@@ -153,41 +152,49 @@ class JointTracker:
                 }
             )
             graphs = StepGraphs(self.device)
-            self._carry()
-            targets.make_room(self._drawn)
+            carried.carry(self._rotations, self._positions)
+            targets.make_room(carried.drawn)
             order = shuffled_views(rng, len(targets), iterations)
             for iteration in range(iterations):
                 for name, rate in rates.items():
                     left = chosen.final_rate ** (iteration / iterations)
                     adam.set_learning_rate(name, level * rate * left)
                 view = int(order[iteration])
-                graphs.run(view, partial(self._step, targets, view, adam, chosen.rigidity / level**2))
+                graphs.run(view, partial(self._step, carried, targets, view, adam, chosen.rigidity / level**2))
         rotations = self._rotations.numpy().astype(np.float64)
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
         return JointPose(rotations.astype(np.float32), self._positions.numpy().copy())  # on the CPU it is the array
 
     def carried(self, cloud: GaussianCloud) -> GaussianCloud:
         """Return a cloud where the joints carry it now."""
-        self._carry()
-        orientations = self._drawn.orientations.numpy().astype(np.float64)
+        self._all.carry(self._rotations, self._positions)
+        orientations = self._all.drawn.orientations.numpy().astype(np.float64)
         orientations /= np.linalg.norm(orientations, axis=1, keepdims=True)
-        positions = self._drawn.positions.numpy().copy()  # on the CPU it is the array
+        positions = self._all.drawn.positions.numpy().copy()  # on the CPU it is the array
         return cloud.with_arrays(positions=positions, orientations=orientations.astype(np.float32))
 
-    def _carry(self) -> None:
-        self._skin.warp(self._rotations, self._positions, self._drawn.positions, self._drawn.orientations)
+    def _for_views(self, views: Sequence[CapturedView]) -> _Carried:
+        """Return what is drawn into reduced views: no more than `GAUSSIANS_PER_PIXEL`, as far as coverage is known."""
+        pixels = float(np.mean([np.inf if view.alpha is None else view.alpha.sum() for view in views]))
+        size = int(len(self._cloud) / max(2 * GAUSSIANS_PER_PIXEL * pixels, 1.0))
+        if size < 2:
+            return self._all
+        labels = hanging_together(self._cloud, self._anchors, size, self.device)
+        merged = Clusters(self._cloud, labels, np.ones(len(self._cloud)))
+        anchors = Anchors(self._anchors.joints[merged.heaviest], self._anchors.weights[merged.heaviest])
+        return _Carried(merged.cloud(self._cloud), anchors, self._joints, self._options.blend, self.device)
 
-    def _step(self, targets: TargetSet, view: int, adam: Adam, rigidity: float) -> None:
+    def _step(self, carried: _Carried, targets: TargetSet, view: int, adam: Adam, rigidity: float) -> None:
         """Draw a view, compare, and move the joints."""
         group, index = targets[view]
-        self._carry()
+        carried.carry(self._rotations, self._positions)
         group.select(index)
         group.rasterizer.redraw()
         group.add_losses(index, self._options.weights, values=False)
         drawn = group.rasterizer.backward()
         self._rotation_gradients.zero_()
         self._position_gradients.zero_()
-        self._skin.add_gradients(
+        carried.skin.add_gradients(
             self._rotations,
             self._positions,
             drawn.positions,
@@ -199,10 +206,51 @@ class JointTracker:
             self._rotations,
             self._positions,
             self._rest_rotations,
-            self._skin.joint_rest_positions,
+            self._all.skin.joint_rest_positions,
             weight=rigidity,
             rotation_gradients=self._rotation_gradients,
             position_gradients=self._position_gradients,
             value=False,
         )
         adam.step()
+
+
+class _Carried:
+    """Gaussians at rest, and where joints carry them."""
+
+    def __init__(
+        self, cloud: GaussianCloud, anchors: Anchors, joints: NDArray[np.float32], blend: str, device: Any
+    ) -> None:
+        self.count = len(cloud)
+        self.skin = Skin(cloud.positions, cloud.orientations, anchors, joints, blend=blend, device=device)
+        self.drawn = GaussianArrays(
+            wp.clone(self.skin.rest_positions),
+            wp.clone(self.skin.rest_orientations),
+            upload(cloud.scales, wp.vec3, device),
+            upload(cloud.opacities, float, device),
+            None,
+            upload(cloud.radiance, wp.vec3, device),  # type: ignore[arg-type]
+        )
+
+    def carry(self, rotations: wp.array, positions: wp.array) -> None:
+        """Move the Gaussians to where the joints are."""
+        self.skin.warp(rotations, positions, self.drawn.positions, self.drawn.orientations)
+
+
+def hanging_together(cloud: GaussianCloud, anchors: Anchors, size: int, device: Any) -> NDArray[np.int64]:
+    """Return clusters of Gaussians that are near each other and hang on the same joint, ``(N,)``.
+
+    Args:
+        cloud: Gaussians.
+        anchors: Their anchors; the first of each counts.
+        size: Most members of a cluster. The last one of a joint has fewer.
+        device: Warp device.
+    """
+    count, joint = len(cloud), anchors.joints[:, 0]
+    places = upload(cloud.positions, wp.vec3, device)
+    order = morton_order(places, places, wp.ones(count, dtype=int, device=device))[0].numpy()[:count]
+    order = order[np.argsort(joint[order], kind="stable")]
+    within = np.arange(count) - np.searchsorted(joint[order], joint[order])
+    labels = np.empty(count, np.int64)
+    labels[order] = np.cumsum(within % size == 0) - 1
+    return labels

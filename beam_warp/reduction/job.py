@@ -20,10 +20,11 @@ from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, require_flip, 
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
+from beam_warp.reduction.changes import changed
 from beam_warp.reduction.merging import MergeOrder
-from beam_warp.reduction.moments import Clusters, changed
 from beam_warp.reduction.refit import refit
 from beam_warp.reduction.sensitivity import Sensitivity, measure_sensitivity
+from beam_warp.world.clusters import Clusters
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 

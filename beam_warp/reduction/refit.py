@@ -16,7 +16,7 @@ from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reduction.moments import Changes, logit_of
+from beam_warp.reduction.changes import Changes, logit_of
 from beam_warp.reduction.sensitivity import MATERIALS, Sensitivity, material_rows
 from beam_warp.world.gaussians import GaussianCloud
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from support.moving_ball import ball_cloud, ball_views, rig
 from support.threads import require_same_on_any_threads
@@ -13,8 +14,10 @@ from support.threads import require_same_on_any_threads
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.reconstruction import joint_tracking
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
-from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
+from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker, hanging_together
+from beam_warp.reconstruction.targets import TargetSet
 from beam_warp.reconstruction.track import (
     GAUSSIANS_PER_JOINT,
     JOINT_LIMITS,
@@ -191,6 +194,46 @@ def test_a_pose_stays_what_it_was_when_the_next_is_found(device):
     tracker.carried(track.cloud)
     np.testing.assert_array_equal(pose.positions, kept[0])
     np.testing.assert_array_equal(carried.positions, kept[1])
+
+
+class TestCoarseLevels:
+    def test_few_gaussians_find_what_all_find(self, device, monkeypatch):
+        """Half a Gaussian for a pixel: about half of them are drawn, or fewer, and the ball is found as well."""
+        key, turn, center = key_track(device), turned(5.0), np.array([0.06, 0.03, 0.02])
+        drawn = []
+
+        def spied(views, count, *rest):
+            drawn.append(count)
+            return TargetSet(views, count, *rest)
+
+        monkeypatch.setattr(joint_tracking, "TargetSet", spied)
+        options = JointOptions(levels=(4, 2), iterations=(16, 24))
+        errors = []
+        for per_pixel in (0.5, np.inf):
+            monkeypatch.setattr(joint_tracking, "GAUSSIANS_PER_PIXEL", per_pixel)
+            raster, target = OPTIONS.refinement.raster, resolve_device(device)
+            tracker = JointTracker(key.cloud, key.anchors, key.graph, key.joints, options, raster, target)
+            pose = tracker.find(ball_views(CAMERAS, center, turn), JointPose(key.turns, key.joints), 1, 0)
+            errors.append(pose.positions - (turn.apply(key.key_joints) + center))
+        few, every = (np.sqrt((error**2).sum(axis=1).mean()) for error in errors)
+        assert drawn[2:] == [400, 400]
+        assert drawn[0] < drawn[1] < 240
+        assert every < PIXEL
+        assert few < PIXEL
+
+    @pytest.mark.parametrize("size", [2, 7, 100])
+    def test_what_merges_hangs_on_one_joint_and_lies_together(self, device, size):
+        track = key_track(device)
+        labels = hanging_together(track.cloud, track.anchors, size, resolve_device(device))
+        joints = track.anchors.joints[:, 0]
+        counts = np.bincount(labels)
+        assert counts.min() >= 1
+        assert counts.max() <= size
+        pairs = set(zip(labels, joints, strict=True))
+        assert len(pairs) == len(counts) == sum(-(-held // size) for held in np.bincount(joints))
+        near = cKDTree(track.cloud.positions).query(track.cloud.positions, 2)[0][:, 1].mean()
+        spread = [np.ptp(track.cloud.positions[labels == label], axis=0).max() for label in range(len(counts))]
+        assert np.mean(spread) < 3.0 * near * np.sqrt(size)
 
 
 class TestRefusals:

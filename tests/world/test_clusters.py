@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from beam_warp.reduction.moments import Changes, Clusters, changed, optical_mass
+from beam_warp.reduction.changes import Changes, changed
+from beam_warp.world.clusters import Clusters, optical_mass
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.quaternions import rotation_matrices
 

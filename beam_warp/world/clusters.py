@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud
+from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.quaternions import rotation_matrices
 
 MOST_OPACITY = 0.99
 """Opacity of merged Gaussians ends where the rasteriser's alpha does; what is beyond makes them wider."""
 
+GEOMETRY = ("positions", "orientations", "scales", "opacities")
+"""What merges by mass; the rest merges by the pixels that members are worth."""
+
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Changes:
-    """What a refit adds to merged Gaussians, in the axes that they have in the reference frame.
-
-    Attributes:
-        shift: Of positions [m], ``(K, 3)``.
-        turn: Rotation that the orientation is multiplied by, on its right, quaternions xyzw ``(K, 4)``.
-        stretch: Natural logarithms of factors of scales, ``(K, 3)``.
-        logit: Of opacities, ``(K,)``.
-        materials: Of materials in the order of `MATERIAL_CHANNELS`, ``(K, 8)``.
-    """
-
-    shift: FloatArray
-    turn: FloatArray
-    stretch: FloatArray
-    logit: FloatArray
-    materials: FloatArray
 
 
 class Clusters:
@@ -44,6 +27,9 @@ class Clusters:
     Geometry is weighted by optical mass, -log(1 - opacity) times the area that a Gaussian shows, which is conserved:
     two Gaussians in one place absorb as one of the sum of their depths (Beer and Lambert). Materials are weighted by
     the pixels in which members are seen. Clusters move by the mean of their members' motions.
+
+    Attributes:
+        heaviest: Row of the member of each cluster that is worth most, ``(K,)``.
     """
 
     def __init__(self, reference: GaussianCloud, labels: NDArray[np.integer], visible: NDArray[np.floating]) -> None:
@@ -62,12 +48,12 @@ class Clusters:
             seen + 1e-6 * (mass / max(mass.max(initial=0.0), 1e-30) + 1e-3) * (seen.mean() + 1e-9)
         )
         order = np.lexsort((np.arange(len(mass)), -(seen + 1e-9 * mass), self._labels))
-        self._heaviest = order[np.flatnonzero(np.diff(self._labels[order], prepend=-1))]
+        self.heaviest = order[np.flatnonzero(np.diff(self._labels[order], prepend=-1))]
         self._orientations, self._scales, self._depth = self._shapes(mass)
 
     def __len__(self) -> int:
         """Return the number of clusters."""
-        return len(self._heaviest)
+        return len(self.heaviest)
 
     def _shares(self, weight: FloatArray) -> csr_array:
         """Return the matrix that takes the weighted mean of every cluster, ``(K, N)``."""
@@ -85,9 +71,9 @@ class Clusters:
         squares, turned = np.linalg.eigh((self._mass @ spread.reshape(-1, 9)).reshape(-1, 3, 3))
         turned[:, :, 2] *= np.sign(np.linalg.det(turned))[:, None]
         orientations, scales = Rotation.from_matrix(turned).as_quat(), np.sqrt(np.maximum(squares, 0.0))
-        alone = np.bincount(self._labels)[self._labels[self._heaviest]] == 1
-        orientations[alone] = cloud.orientations[self._heaviest[alone]]
-        scales[alone] = cloud.scales[self._heaviest[alone]]
+        alone = np.bincount(self._labels)[self._labels[self.heaviest]] == 1
+        orientations[alone] = cloud.orientations[self.heaviest[alone]]
+        scales[alone] = cloud.scales[self.heaviest[alone]]
         depth = np.bincount(self._labels, mass) / np.maximum(shown_area(scales), 1e-30)
         deepest = -np.log1p(-MOST_OPACITY)
         wider = np.where(alone, 1.0, np.sqrt(np.maximum(depth / deepest, 1.0)))
@@ -116,7 +102,7 @@ class Clusters:
         else:
             since = Rotation.from_quat(frame.orientations) * Rotation.from_quat(self._reference.orientations).inv()
             rows = since.as_quat()
-            rows *= np.where((rows * rows[self._heaviest][self._labels]).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+            rows *= np.where((rows * rows[self.heaviest][self._labels]).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
             turns = self._mass @ rows
         return Rotation.from_quat(turns), self._mass @ frame.positions.astype(np.float64)
 
@@ -124,7 +110,7 @@ class Clusters:
         """Return an array of the merged Gaussians, by name."""
         array = getattr(frame, name)
         if name in ("ids", "observability"):
-            return array[self._heaviest]
+            return array[self.heaviest]
         rows = array.reshape(len(array), -1).astype(np.float64)
         if name.endswith("_error"):  # what is known of one member, and how far members are apart
             value = getattr(frame, name.removesuffix("_error")).reshape(len(array), -1).astype(np.float64)
@@ -133,34 +119,8 @@ class Clusters:
         else:
             found = self._seen @ rows
         if name == "normals":
-            found = unit(found, frame.normals[self._heaviest])  # type: ignore[index]
+            found = unit(found, frame.normals[self.heaviest])  # type: ignore[index]
         return found.reshape(len(self), *array.shape[1:]).astype(np.float32)
-
-
-def changed(cloud: GaussianCloud, turn: Rotation, changes: Changes) -> GaussianCloud:
-    """Return merged Gaussians with what a refit adds to them.
-
-    Args:
-        cloud: Of any frame.
-        turn: How they are turned since the reference frame, see `Clusters.motion`.
-        changes: See `Changes`.
-    """
-    own = Rotation.from_quat(cloud.orientations) * Rotation.from_quat(changes.turn)
-    materials = {name: cast("FloatArray", getattr(cloud, name)) for name in MATERIAL_CHANNELS}
-    color, rough, occlusion, lean = np.split(changes.materials, (3, 4, 5), axis=1)
-    return cloud.with_arrays(
-        positions=cloud.positions + turn.apply(changes.shift),
-        orientations=own.as_quat(),
-        scales=cloud.scales * np.exp(changes.stretch),
-        opacities=sigmoid(logit_of(cloud.opacities.astype(np.float64)) + changes.logit),
-        base_color=np.clip(materials["base_color"] + color, 0.0, 1.0),
-        roughness=np.clip(materials["roughness"] + rough[:, 0], 0.0, 1.0),
-        ambient_occlusion=np.clip(materials["ambient_occlusion"] + occlusion[:, 0], 0.0, 1.0),
-        normals=unit(materials["normals"] + turn.apply(lean), materials["normals"]),
-    )
-
-
-GEOMETRY = ("positions", "orientations", "scales", "opacities")
 
 
 def shown_area(scales: NDArray[np.floating]) -> FloatArray:
@@ -179,14 +139,3 @@ def unit(rows: NDArray[np.floating], instead: NDArray[np.floating]) -> FloatArra
     rows = np.asarray(rows, np.float64)
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.where(length > 1e-6, rows / np.maximum(length, 1e-6), instead)
-
-
-def sigmoid(logit: FloatArray) -> FloatArray:
-    """Return the opacities of logits."""
-    return 1.0 / (1.0 + np.exp(-logit))
-
-
-def logit_of(opacity: FloatArray) -> FloatArray:
-    """Return the logits of opacities, those of 0 and 1 finite."""
-    kept = np.clip(opacity, 1e-4, 1.0 - 1e-4)
-    return np.log(kept / (1.0 - kept))
