@@ -98,7 +98,8 @@ class ChangeTest:
 
 
 def _discovered(chance: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which probabilities are discoveries, of which `FALSE_DISCOVERIES` at most are false (Benjamini, Hochberg)."""
+    """Tell which probabilities are discoveries, of which `FALSE_DISCOVERIES` at most are false (Benjamini and
+    Hochberg)."""
     order = np.sort(chance)
     below = order <= FALSE_DISCOVERIES * np.arange(1, len(order) + 1) / len(order)
     return chance <= order[below].max(initial=-1.0)
