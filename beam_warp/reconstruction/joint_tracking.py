@@ -27,8 +27,8 @@ from beam_warp.world.clusters import Clusters
 from beam_warp.world.gaussians import GaussianCloud
 
 GAUSSIANS_PER_PIXEL = 4
-"""Gaussians for a pixel that the subject covers in a reduced image, on each of its two sides: what is finer moves no
-pixel, and few tiles with all Gaussians in each leave most of a GPU idle."""
+"""Gaussians for a pixel that the subject covers in a reduced image, on each of its two sides: what is finer tells
+nothing there, and costs as much as at full resolution."""
 
 
 @dataclass(frozen=True)

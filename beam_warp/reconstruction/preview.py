@@ -28,7 +28,7 @@ MOST_ROWS = 540
 
 FUSED_ROWS = 270
 """Most rows of pixels of the depth that a preview's mesh is fused from: twice as many make four times the triangles,
-which cost most of the time."""
+and show little more."""
 
 FEWEST_ROWS = 240
 """Fewest rows of pixels of a panel: smaller ones are enlarged, so that their titles fit."""

@@ -103,7 +103,7 @@ class MergeOrder:
         one, two = np.repeat(np.arange(count), near.shape[1]), near.reshape(-1)
         low, high = np.minimum(one, two), np.maximum(one, two)
         keys = np.sort((low * count + high)[low < high])
-        keys = keys[np.diff(keys, prepend=-1) > 0]  # forty times faster than NumPy's unique, which hashes
+        keys = keys[np.diff(keys, prepend=-1) > 0]  # as by np.unique, which hashes and takes far longer
         pairs = np.stack([keys // count, keys % count], axis=1)
         clusters, device = PairedClusters(), self._device
         for name in ("weights", "edges", "forms", "materials"):

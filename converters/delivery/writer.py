@@ -42,7 +42,7 @@ SMALLEST = 9
 """Level of zlib of what is kept."""
 
 MEMORY = 9
-"""Memory level of zlib: the longest blocks. Without matches of few bytes, planes take 3 % less than by its defaults."""
+"""Memory level of zlib: the longest blocks. Without matches of few bytes, planes take less than by its defaults."""
 
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every entry, so that the same Gaussians give the same bytes."""

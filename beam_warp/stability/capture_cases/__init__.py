@@ -7,17 +7,16 @@ studio delivers it is a flawed copy, which `beam_warp.stability.flaws` writes.
 
 from beam_warp.stability.capture_cases import cameras, delivered, subjects, surfaces
 
+SURFACE_CASES = [surfaces.no_shading, surfaces.mirror_like, surfaces.thin_staff, surfaces.hair, surfaces.close_layers]
+"""Cases of surfaces that images say little about."""
+
 CAPTURE_CASES = [
     subjects.as_it_is,
     subjects.every_second_frame,
     subjects.every_third_frame,
     subjects.no_texture,
     subjects.self_contact,
-    surfaces.no_shading,
-    surfaces.mirror_like,
-    surfaces.thin_staff,
-    surfaces.hair,
-    surfaces.close_layers,
+    *SURFACE_CASES,
     cameras.black_camera,
     cameras.empty_camera,
     cameras.camera_without_files,
@@ -33,14 +32,5 @@ CAPTURE_CASES = [
 ]
 """Every case, in the order of the table; the first is the capture as it is."""
 
-TRACED_CASES = [
-    subjects.no_texture,
-    subjects.self_contact,
-    surfaces.no_shading,
-    surfaces.mirror_like,
-    surfaces.thin_staff,
-    surfaces.hair,
-    surfaces.close_layers,
-    subjects.object_appears,
-]
+TRACED_CASES = [subjects.no_texture, subjects.self_contact, *SURFACE_CASES, subjects.object_appears]
 """Cases that show another subject than a given capture, and are path traced."""
