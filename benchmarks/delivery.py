@@ -3,9 +3,9 @@
     python benchmarks/delivery.py [--quick] [--parts PART] [--repeats 9] --out result.json
 
 The take is `delivery_take.take`. Relit images of the container are compared with those of the take itself, drawn by the
-same deferred renderer. Times are those of the processor, which other programs disturb less than the clock; NumPy has one
-thread, and in Node.js those that collect garbage count as well. Pages have only a clock, so Chromium's times need a
-machine that does nothing else. The lowest of repeats counts.
+same deferred renderer. Times are those of the processor, which other programs disturb less than the clock: of one
+thread in NumPy, and in Node.js of all, with those that collect garbage. Pages have only a clock, so Chromium's times
+need a machine that does nothing else. The lowest of repeats counts.
 
 - ``takes``: a take in containers of several bounds: kilobytes a frame, errors, relit images, time to decode.
 - ``codecs``: the blocks of the first container by several codecs.

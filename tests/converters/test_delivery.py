@@ -190,7 +190,7 @@ def spelled_out(path, frame):
 
 
 def with_parts(path, place, change):
-    """The same container, whose manifest says ``change(parts)`` of the parts of each block; None: nothing, as before."""
+    """The same container, whose manifest says ``change(parts)`` of each block's parts; None: nothing, as before."""
     with zipfile.ZipFile(path) as files:
         content = {name: files.read(name) for name in files.namelist()}
     manifest = json.loads(content["manifest.json"])
@@ -287,7 +287,8 @@ class TestDecoders:
         take.write_bytes(content)
         script = """
             for (const path of process.argv.slice(2)) {
-              const take = await open(path), said = (error) => console.log(error instanceof DeliveryError, error.message);
+              const take = await open(path);
+              const said = (error) => console.log(error instanceof DeliveryError, error.message);
               for (const number of [0, 13]) await take.frame(number).catch(said);
             }
             """
