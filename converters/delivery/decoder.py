@@ -26,8 +26,7 @@ COMPONENTS |= dict.fromkeys(("positions", "orientations", "turns", "scales", "ba
 COMPONENTS |= {f"radiance_{k}": 3 for k in range(25)}
 REQUIRED = {"positions", "orientations", "scales", "opacities"}
 MAX_FRAMES, FREE_BYTES, MAX_RATIO = 30, 2**24, 64  # of a segment; b bytes unpack to FREE_BYTES + MAX_RATIO b
-FREE_COUNT = 2**18  # Gaussians; more need a byte each in the static block
-LARGEST = 1e6  # offset or weight: sums and squares of values stay finite in float32
+FREE_COUNT, LARGEST = 2**18, 1e6  # of Gaussians that need no byte each in the static block; of offsets and weights
 
 Float32 = NDArray[np.float32]
 Arrays = dict[str, Float32]
@@ -56,14 +55,13 @@ class Component:
     summed: Float32  # (S, N), the first planes, which all frames use
     plain: list[Callable[[], NDArray[np.signedinteger]]]  # return the others, P of (N,); most are of one frame only
 
-    def at(self, frame: int) -> Float32:
-        """Return the numbers at a frame of the block, ``(N,)``."""
+    def add(self, frame: int, values: Float32) -> None:
+        """Add the numbers at a frame of the block to others, ``(N,)``."""
         offset, first, last = np.split(self.weights[frame], [1, 1 + len(self.summed)])
-        values = np.einsum("s,sn->n", first, self.summed)  # of few rows, faster than a product of matrices
+        values += np.einsum("s,sn->n", first, self.summed)  # of few rows, faster than a product of matrices
         values += offset
         for plane in np.flatnonzero(last):
             values += self.plain[plane]() * last[plane]
-        return values
 
 
 class Container:
@@ -84,7 +82,7 @@ class Container:
         _check(self.manifest)
         tracks = self.tracks(self.manifest["static"], 1)
         _require(tracks.keys() >= REQUIRED, f"the static block must hold {', '.join(sorted(REQUIRED))}", sorted(tracks))
-        self._raw = self._values(tracks, 0, self.manifest["static"]["file"])
+        self._raw = self._values(tracks, 0, self.manifest["static"]["file"], {})
         self.still: Arrays = {name: activated(name, values) for name, values in self._raw.items()}
         self._unpacked = -1, dict[str, Track]()
 
@@ -116,9 +114,14 @@ class Container:
         with _sound(name):
             return _tracks(packed, entry, frames, self.manifest["count"])
 
-    def _values(self, tracks: dict[str, Track], frame: int, name: str) -> Arrays:
+    def _values(self, tracks: dict[str, Track], frame: int, name: str, start: Arrays) -> Arrays:
+        shapes = {array: (len(track), self.manifest["count"]) for array, track in tracks.items()}
+        found = {array: start[array].copy() if array in start else np.zeros(shapes[array], "f4") for array in tracks}
         with _sound(name):
-            return {array: np.stack([component.at(frame) for component in track]) for array, track in tracks.items()}
+            for array, track in tracks.items():
+                for component, row in zip(track, found[array], strict=True):
+                    component.add(frame, row)
+        return found
 
     def frame(self, number: int) -> Arrays:
         """Return the arrays of a frame by name, ``(C, N)``: quaternions xyzw, linear scales, unit normals."""
@@ -127,9 +130,7 @@ class Container:
         if self._unpacked[0] != index:
             self._unpacked = index, self.tracks(segments[index], segments[index]["frames"])
         tracks, at = self._unpacked[1], number - segments[index]["first"]
-        raw = self._values(tracks, at, segments[index]["file"])
-        for name in raw.keys() & self._raw.keys():
-            raw[name] += self._raw[name]
+        raw = self._values(tracks, at, segments[index]["file"], self._raw)
         turn = quaternions(raw.pop("turns")) if "turns" in raw else None
         arrays = self.still | {name: activated(name, values) for name, values in raw.items()}
         for name, turned in (("orientations", product), ("normals", rotated)):
@@ -150,10 +151,9 @@ def _sound(name: str, kind: str = "a sound block") -> Iterator[None]:
 def _check(said: Any) -> None:
     """Refuse a manifest whose numbers and names cannot be right."""
     _require(isinstance(said, dict), f"{MANIFEST} must hold an object", said)
-    version, rate, static, segments = (said.get(name) for name in ("version", "rate", "static", "segments"))
+    version, rate, static, segments, following = *map(said.get, ("version", "rate", "static", "segments")), 0
     _require((said.get("format"), version) == ("b4d", 1), "version must be 1 of b4d", version)
     _require(type(rate) in (int, float) and 1e-3 <= rate <= 1e6, "rate must be a rate", rate)
-    following = 0
     _require(isinstance(static, dict) and isinstance(segments, list), "static and segments must be there", static)
     for entry in (static, *segments):
         name = entry.get("file") if isinstance(entry, dict) else entry
