@@ -10,7 +10,7 @@ A seek goes to a segment that is not at hand ("cold"), or to one that is ("warm"
 Gaussians are on the GPU in order of depth, and "drawn" when the picture can be read. While the take plays, memory is
 sampled after a collection of garbage: the page's heap by the DevTools protocol, what the page's process and the one
 that draws hold by the system, textures by the renderer's own count. A line is fitted to the samples after the first
-fifth; its slope comes with a standard error.
+fifth; its slope comes with a standard error, which knows that a browser's memory rises and falls in waves.
 """
 
 from __future__ import annotations
@@ -182,13 +182,18 @@ def resident(process: int) -> float:
 
 
 def slope(samples: list[dict[str, float]], name: str) -> list[float]:
-    """Return by how much a quantity grows a minute, and the standard error of that."""
+    """Return by how much a quantity grows a minute, and the standard error of that.
+
+    Neighbouring samples resemble each other. They count as so many as their correlation leaves (Santer et al. 2000).
+    """
     kept = samples[int(SETTLING * len(samples)) :]
     minutes, values = (np.array([each[key] for each in kept]) for key in ("minutes", name))
     away = minutes - minutes.mean()
     grows = (away @ values) / (away @ away)
     rest = values - values.mean() - grows * away
-    return [float(grows), float(np.sqrt((rest @ rest) / max(len(kept) - 2, 1) / (away @ away)))]
+    alike = max((rest[1:] @ rest[:-1]) / max(rest @ rest, 1e-12), 0.0)
+    independent = len(kept) * (1.0 - alike) / (1.0 + alike)
+    return [float(grows), float(np.sqrt((rest @ rest) / max(independent - 2.0, 1.0) / (away @ away)))]
 
 
 def seek_row(seeks: list[dict[str, float]]) -> dict[str, list[float]]:
@@ -214,9 +219,8 @@ def measure(backend: str, path: Path, arguments: argparse.Namespace) -> dict[str
         seconds, samples = 60.0 * arguments.minutes, []
         page.evaluate(PLAY, seconds)
         began = time.monotonic()
-        for number in range(SAMPLES):
-            due = began + seconds * (number + 1) / (SAMPLES + 1)
-            page.wait_for_timeout(max(1000.0 * (due - time.monotonic()), 0.0))
+        while time.monotonic() - began < seconds * SAMPLES / (SAMPLES + 1):
+            page.wait_for_timeout(1000.0 * seconds / (SAMPLES + 1))
             samples.append({"minutes": (time.monotonic() - began) / 60.0} | memory(page, browser))
         page.wait_for_function("played.isOver")
         played, said = page.evaluate("[played, heard]")

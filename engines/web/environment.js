@@ -355,6 +355,14 @@ export function inWorker(maker) {
   };
 }
 
+/** Return what was promised under a name; make it if nothing was, or if that came to nothing. */
+function kept(promises, name, make) {
+  return promises[name] ??= make().catch((error) => {
+    delete promises[name];
+    throw error;
+  });
+}
+
 /** An environment that is ready to light: its irradiance, the map, and the levels of roughness, one below the other. */
 export class Environment {
   /** Read a picture from its address or from its bytes, and blur it. */
@@ -376,9 +384,7 @@ export class Environment {
 
   /** Return a number of regions of equal power: `{direction, halfAngle, moments}` each, in the environment's own axes. */
   async regions(count) {
-    this.cuts ??= {};
-    this.cuts[count] ??= Environment.made({map: this.maps[1], regions: count}).then(({regions}) => regions);
-    return this.cuts[count];
+    return (await kept(this.cuts ??= {}, count, () => Environment.made({map: this.maps[1], regions: count}))).regions;
   }
 
   /** Return light of one radiance from everywhere; without arguments, darkness. */
@@ -389,7 +395,7 @@ export class Environment {
 
   /** Return the terms of the specular albedo, which all environments share; the first time a worker finds them. */
   static table() {
-    return Environment.shared ??= Environment.made({});
+    return kept(Environment, "shared", () => Environment.made({}));
   }
 
   static async made(message) {

@@ -278,10 +278,10 @@ export class Relight extends EventTarget {
       bytes: 4 * texels(summed.texture) + texels(plain.texture)};
   }
 
-  /** Write planes that no frame has needed yet, a few at a time, so that pictures are drawn meanwhile. */
+  /** Write planes that no frame has needed yet, a few at a time, so that pictures are drawn meanwhile; an order of depth comes first. */
   async #bringRest(late) {
     for (const [name, write] of late) {
-      if (late.size % 8 === 0) await new Promise((resolve) => setTimeout(resolve));
+      if (late.size % 8 === 0) await new Promise((resolve) => setTimeout(resolve)).then(() => this.#sorting);
       if (late.delete(name)) write();
     }
   }

@@ -10,17 +10,24 @@ export function sortingWorker() {
 
   /** Return indices by rising key, equal keys in their order: two rounds of 16 bits. */
   function sorted(keys) {
-    let from = new Uint32Array(count), to = new Uint32Array(count);
-    for (let i = 0; i < count; i++) from[i] = i;
-    for (const shift of [0, 16]) {
-      const starts = new Uint32Array(65537);
-      for (let i = 0; i < count; i++) starts[((keys[i] >>> shift) & 65535) + 1]++;
-      for (let k = 0; k < 65536; k++) starts[k + 1] += starts[k];
-      for (let i = 0; i < count; i++) to[starts[(keys[from[i]] >>> shift) & 65535]++] = from[i];
-      [from, to] = [to, from];
-    }
+    const from = new Uint32Array(keys.length), to = new Uint32Array(keys.length);
+    for (let i = 0; i < from.length; i++) from[i] = i;
+    byHalf(keys, from, to, 0);
+    byHalf(keys, to, from, 16);
     return from;
   }
+
+  /** Lay indices into another array by 16 bits of their keys. */
+  function byHalf(keys, from, to, shift) {
+    const starts = new Uint32Array(65537);
+    for (let i = 0; i < keys.length; i++) starts[((keys[i] >>> shift) & 65535) + 1]++;
+    for (let k = 0; k < 65536; k++) starts[k + 1] += starts[k];
+    for (let i = 0; i < keys.length; i++) to[starts[(keys[from[i]] >>> shift) & 65535]++] = from[i];
+  }
+
+  // One loop for each kind of array: one that meets another kind is compiled anew, which a first seek would wait for.
+  const addNumbers = (out, weight, values) => { for (let i = 0; i < out.length; i++) out[i] += weight * values[i]; };
+  const addOctets = (out, weight, values) => { for (let i = 0; i < out.length; i++) out[i] += weight * values[i]; };
 
   /** Evaluate positions, axes of the container. */
   function evaluate({frame, segment, heads, terms}) {
@@ -32,7 +39,7 @@ export function sortingWorker() {
       if (heads[c]) for (let i = 0; i < count; i++) out[i] += heads[c];
       for (const [plane, weight] of terms[c]) {
         const values = segments.get(segment)[c][plane];
-        for (let i = 0; i < count; i++) out[i] += weight * values[i];
+        (values instanceof Int8Array ? addOctets : addNumbers)(out, weight, values);
       }
     }
   }

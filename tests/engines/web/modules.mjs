@@ -1,7 +1,7 @@
 // What the module computes without a browser, for tests/engines/web/test_modules.py: reads a job from stdin.
 import {readFileSync} from "node:fs";
 import {Take} from "../../../engines/web/b4d.js";
-import {prefilterWorker, readHdr} from "../../../engines/web/environment.js";
+import {Environment, prefilterWorker, readHdr} from "../../../engines/web/environment.js";
 import {checkedLights, lampNumbers, mapNumbers, shadowViews} from "../../../engines/web/lights.js";
 import {sortingWorker} from "../../../engines/web/sorting.js";
 import {Segments} from "../../../engines/web/segments.js";
@@ -16,6 +16,21 @@ const jobs = {
   prefilter: ({height, radiance}) => {
     const handle = prefilterWorker(), {albedo} = handle({}), {maps} = handle({map: {height, radiance: floats(radiance)}, most: 1024});
     return {maps: maps.map((map) => ({height: map.height, radiance: Array.from(map.radiance)})), albedo: Array.from(albedo)};
+  },
+  /** Ask for what a worker makes, which fails the first time it is asked; says how each request ended, and how often it was asked. */
+  retry: async () => {
+    let count = 0;
+    Environment.made = async () => {
+      if (!count++) throw new Error("no worker");
+      return {regions: [count]};
+    };
+    const light = Object.assign(new Environment(), {maps: []}), ended = [];
+    for (const ask of [() => Environment.table(), () => light.regions(4)]) {
+      count = 0;
+      for (let k = 0; k < 3; k++) ended.push(await ask().then(() => "made", (error) => error.message));
+      ended.push(count);
+    }
+    return ended;
   },
   lights: ({lights, casters, size}) => checkedLights(lights).map((light) => {
     const views = shadowViews(light, casters, size);

@@ -108,6 +108,12 @@ def test_light_is_read_and_blurred_as_python_does(tmp_path):
 
 
 @needs_node
+def test_what_a_worker_failed_to_make_is_made_when_it_is_asked_for_again():
+    (ended,) = run({"job": "retry"})
+    assert ended == 2 * ["no worker", "made", "made", 2]
+
+
+@needs_node
 def test_lamps_and_their_maps_stand_where_python_puts_them():
     casters = ShadowCasters(np.array([0.1, -0.2, 0.4]), 0.8)
     given = {"center": casters.center.tolist(), "radius": casters.radius}
