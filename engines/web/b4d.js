@@ -160,8 +160,7 @@ export function unpacking() {
 
   /** Return the tracks that a block describes, without planes, and where those begin. */
   function described(content, frames, count, unpacked) {
-    const tracks = {};
-    let at = 4 + new DataView(content.buffer, content.byteOffset).getUint32(0, true), end = 0;
+    let tracks = {}, at = 4 + new DataView(content.buffer, content.byteOffset).getUint32(0, true), end = 0;
     for (const {name, planes} of JSON.parse(new TextDecoder().decode(content.subarray(4, at))).arrays) tracks[name] = planes.map(([summed, plain]) => {
       const sizes = [...summed, ...plain], columns = 1 + sizes.length, weights = new Float32Array(content.slice(at, at += 4 * frames * columns).buffer);
       must(sizes.every((size) => [1, 2, 3, 4].includes(size)) && weights.every((w) => Math.abs(w) <= 1e6), "planes must have 1 to 4 bytes, and weights at most 1e6", name);
@@ -201,9 +200,10 @@ export function unpacking() {
         const piece = isWhole ? null : packed.subarray(start, start += parts[part]), isSummed = k < first;
         if (!planes[k] && (isWhole || isSummed || weights[frame * columns + 1 + k])) wanted.push({piece, planes, k, size, isSummed});
       });
-      if (!isWhole) [content, at] = [await inflated([...wanted.map(({piece}) => piece), end], wanted.reduce((sum, {size}) => sum + size * count, 0), true), 0];
+      const sum = wanted.reduce((before, {size}) => before + size * count, 0);
+      if (!isWhole) [content, at] = [await inflated([...wanted.map(({piece}) => piece), end], sum, true), 0];
+      must(!wanted.length || content.length === at + sum, "planes must be as long as they say", content?.length);
       for (const {planes, k, size, isSummed} of wanted) planes[k] = plane(content.subarray(at, at += size * count), count, size, isSummed);
-      must(!wanted.length || at === content.length, "planes must be as long as they say", at);
       return {tracks, transfer: [...new Set(components.flatMap(({planes}) => planes.map(({buffer}) => buffer)))]};
     } catch (error) {
       throw new Error(`${file} must be a sound block, got: ${error.message}`);
