@@ -3,8 +3,9 @@
     python benchmarks/delivery.py [--quick] [--parts PART] [--repeats 9] --out result.json
 
 The take is `delivery_take.take`. Relit images of the container are compared with those of the take itself, drawn by the
-same deferred renderer. Times are those of one thread's processor, which other programs disturb less than the clock; the
-lowest of repeats counts.
+same deferred renderer. Times are those of the processor, which other programs disturb less than the clock: of one
+thread in NumPy, and in Node.js of all, with those that collect garbage. Pages have only a clock, so Chromium's times
+need a machine that does nothing else. The lowest of repeats counts.
 
 - ``takes``: a take in containers of several bounds: kilobytes a frame, errors, relit images, time to decode.
 - ``codecs``: the blocks of the first container by several codecs.
@@ -12,6 +13,7 @@ lowest of repeats counts.
 
 from __future__ import annotations
 
+import copy
 import functools
 import io
 import json
@@ -36,6 +38,11 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from engines.web.pages import chromium, open_page
+from web.viewers import CHROMIUM
+
 from beam_warp.converters import WriteOptions, read, write
 from beam_warp.converters.delivery.decoder import Container
 from beam_warp.demo.figure import build_figure
@@ -55,6 +62,12 @@ Row = dict[str, Any]
 
 LIGHTS = ("studio", "sunset")
 SCRIPT = Path(__file__).with_name("decode_delivery.mjs")
+IN_A_PAGE = """async ([source, repeats]) => {
+  const {decoding} = await import(URL.createObjectURL(new Blob([source], {type: "text/javascript"})));
+  const bytes = new Uint8Array(await (await fetch("/take.b4d")).arrayBuffer());
+  const opened = await Take.open("take.b4d", async (name, start, size) => bytes.subarray(start, start + size));
+  return decoding(Take, opened, repeats, () => performance.now());
+}"""
 
 
 @dataclass(frozen=True)
@@ -107,6 +120,7 @@ def takes(bench: Bench) -> Iterator[Row]:
                     "relit_loss_db": float(loss_of(min(differences.values()))),
                     "numpy_ms": numpy_ms(path, bench.repeats),
                     "node_ms": node_ms(path, bench.repeats),
+                    "chromium_ms": chromium_ms(path, bench.repeats),
                 }
             )
             say(json.dumps(rows[-1]))
@@ -168,24 +182,34 @@ def errors(clouds: Sequence[GaussianCloud], back: Sequence[GaussianCloud]) -> Ro
 
 
 def numpy_ms(path: Path, repeats: int) -> Row:
-    """Return what a frame costs in NumPy: its part of unpacking its segment, and the frame itself [ms]."""
-    container = Container(path)
-    entry = container.manifest["segments"][0]
-    count = entry["frames"]
+    """Return what a frame costs in NumPy [ms]; see ``decode_delivery.mjs`` for the names."""
+    opened = Container(path)
+    frames = opened.manifest["frames"]
+
+    def play(_: int) -> None:
+        take = copy.copy(opened)  # which has no segment at hand
+        for number in range(frames):
+            take.frame(number)
+
     with threadpool_limits(1):
-        unpacked = lowest(lambda _: container.tracks(entry, count), repeats) / count
-        decoded = lowest(lambda number: container.frame(number % count), 3 * repeats)
-    return {"unpack": unpacked, "frame": decoded, "all": unpacked + decoded}
+        played = [each / frames for each in times(play, repeats)]
+        jump = lowest(lambda _: copy.copy(opened).frame(frames // 2), repeats)
+    return {"all": min(played), "median": float(np.median(played)), "random": jump}
 
 
 def lowest(work: Callable[[int], object], repeats: int) -> float:
-    """Return the lowest time of the processor that work takes [ms]; the first round is not counted."""
+    """Return the lowest time of the processor that work takes [ms]."""
+    return min(times(work, repeats))
+
+
+def times(work: Callable[[int], object], repeats: int) -> list[float]:
+    """Return the times of the processor that work takes [ms]; the first round is not counted."""
     found = []
     for number in range(repeats + 1):
         started = time.process_time()
         work(number)
-        found.append(time.process_time() - started)
-    return 1e3 * min(found[1:])
+        found.append(1e3 * (time.process_time() - started))
+    return found[1:]
 
 
 def node_ms(path: Path, repeats: int) -> Row | None:
@@ -195,6 +219,15 @@ def node_ms(path: Path, repeats: int) -> Row | None:
         return None
     done = subprocess.run([node, SCRIPT, path, str(repeats)], capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
+
+
+def chromium_ms(path: Path, repeats: int) -> Row | None:
+    """Return the same in Chromium, by the clock; None where there is no Chromium."""
+    if CHROMIUM is None:
+        return None
+    with chromium() as browser:
+        page = open_page(browser, {"take.b4d": path})
+        return page.evaluate(IN_A_PAGE, [SCRIPT.read_text(encoding="utf-8"), repeats])
 
 
 def _webp(content: bytes) -> bytes:

@@ -139,10 +139,9 @@ def _judge_duplicates(rig: Mapping[str, Camera], findings: Findings) -> None:
 
 def _neighbours(rows: NDArray[np.float64]) -> list[tuple[int, int]]:
     """Return pairs of rows that differ by less than 1 everywhere: of each row one at most, so that few are many."""
-    _, firsts, groups = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    first = firsts[groups.reshape(-1)]
-    pairs = {(int(i), row) for row, i in enumerate(first) if i != row}
-    firsts = np.sort(firsts)
+    found: dict[bytes, int] = {}
+    pairs = {(i, row) for row, values in enumerate(rows) if (i := found.setdefault(values.tobytes(), row)) != row}
+    firsts = np.array([*found.values()])
     distances, nearest = cKDTree(rows[firsts]).query(rows[firsts], k=[2], p=np.inf, distance_upper_bound=1.0)
     close = np.isfinite(distances[:, 0])
     near = np.stack([firsts[close], firsts[nearest[close, 0]]], axis=1)

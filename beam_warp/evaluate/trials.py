@@ -187,7 +187,7 @@ def _exposed(environment: EnvironmentMap) -> EnvironmentMap:
     """Return an environment of at most `MOST_ROWS` rows, exposed."""
     if environment.height > MOST_ROWS:
         environment = environment.resized(MOST_ROWS, 2 * MOST_ROWS)
-    brightest = float(environment.irradiance_map(32, 64).max())
+    brightest = float(environment.default_irradiance.max())  # which the scaled map keeps, for shading
     if not brightest > 0.0:
         raise InvalidOptionError("environment must have light, got a black one. Choose another map.")
     return environment.scaled(BRIGHTEST_WHITE * np.pi / brightest)

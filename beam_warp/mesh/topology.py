@@ -52,13 +52,13 @@ def mesh_report(mesh: trimesh.Trimesh) -> MeshReport:
     distinct, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
     open_edges = distinct[uses == 1]
     ends = np.stack([open_edges // max(count, 1), open_edges % max(count, 1)], axis=1)
-    rims = np.unique(_labels(ends, count)[ends[:, 0]]) if len(ends) else ends
+    rims = np.bincount(_labels(ends, count)[ends[:, 0]]) if len(ends) else ends
     return MeshReport(
         count,
         len(faces),
-        len(np.unique(face_parts(faces, count))),
+        int(np.count_nonzero(np.bincount(face_parts(faces, count)))),
         len(open_edges),
-        len(rims),
+        int(np.count_nonzero(rims)),
         int((uses > 2).sum()),
         float(mesh.area),
     )

@@ -6,10 +6,14 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import struct
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +26,7 @@ COMPONENTS |= dict.fromkeys(("positions", "orientations", "turns", "scales", "ba
 COMPONENTS |= {f"radiance_{k}": 3 for k in range(25)}
 REQUIRED = {"positions", "orientations", "scales", "opacities"}
 MAX_FRAMES, FREE_BYTES, MAX_RATIO = 30, 2**24, 64  # of a segment; b bytes unpack to FREE_BYTES + MAX_RATIO b
-FREE_COUNT = 2**18  # Gaussians; more need a byte each in the static block
-LARGEST = 1e6  # offset or weight: sums and squares of values stay finite in float32
+FREE_COUNT, LARGEST = 2**18, 1e6  # of Gaussians that need no byte each in the static block; of offsets and weights
 
 Float32 = NDArray[np.float32]
 Arrays = dict[str, Float32]
@@ -50,7 +53,15 @@ class Component:
 
     weights: Float32  # (F, 1 + S + P)
     summed: Float32  # (S, N), the first planes, which all frames use
-    plain: list[NDArray[np.signedinteger]]  # the others, P of (N,); most have a weight in one frame only
+    plain: list[Callable[[], NDArray[np.signedinteger]]]  # return the others, P of (N,); most are of one frame only
+
+    def add(self, frame: int, values: Float32) -> None:
+        """Add the numbers at a frame of the block to others, ``(N,)``."""
+        offset, first, last = np.split(self.weights[frame], [1, 1 + len(self.summed)])
+        values += np.einsum("s,sn->n", first, self.summed)  # of few rows, faster than a product of matrices
+        values += offset
+        for plane in np.flatnonzero(last):
+            values += self.plain[plane]() * last[plane]
 
 
 class Container:
@@ -66,15 +77,12 @@ class Container:
         self._path = Path(path) / MANIFEST if Path(path).is_dir() else Path(path)
         self._is_archive, self._start = self._path.suffix != ".json", 0
         content = self._manifest()
-        try:
+        with _sound(MANIFEST, "JSON"):
             self.manifest: dict[str, Any] = json.loads(content)
-        except (ValueError, RecursionError) as error:
-            raise DeliveryError(f"{MANIFEST} must be JSON, got {str(error)[:80]}. Export it again.") from None
-        _require(isinstance(self.manifest, dict), f"{MANIFEST} must hold an object", self.manifest)
         _check(self.manifest)
         tracks = self.tracks(self.manifest["static"], 1)
         _require(tracks.keys() >= REQUIRED, f"the static block must hold {', '.join(sorted(REQUIRED))}", sorted(tracks))
-        self._raw = {name: _values(track, 0) for name, track in tracks.items()}
+        self._raw = self._values(tracks, 0, self.manifest["static"]["file"], {})
         self.still: Arrays = {name: activated(name, values) for name, values in self._raw.items()}
         self._unpacked = -1, dict[str, Track]()
 
@@ -95,8 +103,7 @@ class Container:
 
     def tracks(self, entry: dict[str, Any], frames: int) -> dict[str, Track]:
         """Read, check and unpack a block, one range of the file; `DeliveryError` if it was altered or is malformed."""
-        name, size = entry["file"], entry["unpacked"]
-        path = self._path if self._is_archive else self._path.with_name(name)
+        name, path = entry["file"], self._path if self._is_archive else self._path.with_name(entry["file"])
         _require(path.is_file(), "a container must hold all its files", f"no {name}")
         with path.open("rb") as stream:
             stream.seek(self._start + entry["offset"] if self._is_archive else 0)
@@ -104,28 +111,26 @@ class Container:
         _require(len(packed) == entry["bytes"], f"{name} must have {entry['bytes']} bytes", len(packed))
         digest = hashlib.sha256(packed).hexdigest()
         _require(digest == entry.get("sha256"), f"{name} must have the digest that {MANIFEST} says", digest)
-        try:
-            content = zlib.decompressobj().decompress(packed, size + 1)
-            _require(len(content) == size, f"it must unpack to {size} bytes", len(content))
-            return _tracks(content, frames, self.manifest["count"])
-        except (zlib.error, struct.error, KeyError, TypeError, ValueError, RecursionError) as error:
-            reason = " ".join(str(error).split())[:160]
-            raise DeliveryError(
-                f"{name} must be a sound block, got a broken one ({reason}). Export it again."
-            ) from None
+        with _sound(name):
+            return _tracks(packed, entry, frames, self.manifest["count"])
+
+    def _values(self, tracks: dict[str, Track], frame: int, name: str, start: Arrays) -> Arrays:
+        shapes = {array: (len(track), self.manifest["count"]) for array, track in tracks.items()}
+        found = {array: start[array].copy() if array in start else np.zeros(shapes[array], "f4") for array in tracks}
+        with _sound(name):
+            for array, track in tracks.items():
+                for component, row in zip(track, found[array], strict=True):
+                    component.add(frame, row)
+        return found
 
     def frame(self, number: int) -> Arrays:
         """Return the arrays of a frame by name, ``(C, N)``: quaternions xyzw, linear scales, unit normals."""
         segments = self.manifest["segments"]
         index = next(i for i, entry in enumerate(segments) if number < entry["first"] + entry["frames"])
-        unpacked, tracks = self._unpacked
-        if unpacked != index:
-            tracks = self.tracks(segments[index], segments[index]["frames"])
-            self._unpacked = index, tracks
-        at = number - segments[index]["first"]
-        raw = {name: _values(track, at) for name, track in tracks.items()}
-        for name in raw.keys() & self._raw.keys():
-            raw[name] += self._raw[name]
+        if self._unpacked[0] != index:
+            self._unpacked = index, self.tracks(segments[index], segments[index]["frames"])
+        tracks, at = self._unpacked[1], number - segments[index]["first"]
+        raw = self._values(tracks, at, segments[index]["file"], self._raw)
         turn = quaternions(raw.pop("turns")) if "turns" in raw else None
         arrays = self.still | {name: activated(name, values) for name, values in raw.items()}
         for name, turned in (("orientations", product), ("normals", rotated)):
@@ -134,13 +139,21 @@ class Container:
         return arrays
 
 
+@contextmanager
+def _sound(name: str, kind: str = "a sound block") -> Iterator[None]:
+    """Name the block in what is wrong with its content."""
+    try:
+        yield
+    except (zlib.error, struct.error, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise DeliveryError(f"{name} must be {kind}, got {str(error)[:160]!r}. Export it again.") from None
+
+
 def _check(said: Any) -> None:
     """Refuse a manifest whose numbers and names cannot be right."""
-    _require((said.get("format"), said.get("version")) == ("b4d", 1), "version must be 1 of b4d", said.get("version"))
-    _require(
-        type(said.get("rate")) in (int, float) and 1e-3 <= said["rate"] <= 1e6, "rate must be a rate", said.get("rate")
-    )
-    static, segments, following = said.get("static"), said.get("segments"), 0
+    _require(isinstance(said, dict), f"{MANIFEST} must hold an object", said)
+    version, rate, static, segments, following = *map(said.get, ("version", "rate", "static", "segments")), 0
+    _require((said.get("format"), version) == ("b4d", 1), "version must be 1 of b4d", version)
+    _require(type(rate) in (int, float) and 1e-3 <= rate <= 1e6, "rate must be a rate", rate)
     _require(isinstance(static, dict) and isinstance(segments, list), "static and segments must be there", static)
     for entry in (static, *segments):
         name = entry.get("file") if isinstance(entry, dict) else entry
@@ -156,55 +169,44 @@ def _check(said: Any) -> None:
     _whole(said.get("frames"), "frames", max(following, 1), following)
 
 
-def _tracks(content: bytes, frames: int, count: int) -> dict[str, Track]:
-    """Split an unpacked block into its arrays."""
+def _tracks(packed: bytes, entry: dict[str, Any], frames: int, count: int) -> dict[str, Track]:
+    """Split a block into its arrays; planes that are parts of their own are unpacked when they are needed."""
+    parts, sizes, weights, found = entry.get("parts"), [], [], dict[str, Track]()
+    content = zlib.decompressobj().decompress(packed[: parts[0]] if parts else packed, entry["unpacked"] + 1)
     at = 4 + struct.unpack_from("<I", content)[0]
-    arrays, weights, found = json.loads(content[4:at])["arrays"], [], {}
-    for array in arrays:
-        name, planes = array["name"], array["planes"]
+    arrays = json.loads(content[4:at])["arrays"]
+    for name, planes in ((array["name"], array["planes"]) for array in arrays):
         _require(name in COMPONENTS and len(planes) == COMPONENTS[name], "arrays must be known", name)
         for summed, plain in planes:
-            _require(
-                all(type(n) is int and 1 <= n <= 4 for n in (*summed, *plain)), "planes must have 1 to 4 bytes", name
-            )
-            columns = 1 + len(summed) + len(plain)
-            weights.append(np.frombuffer(content, "<f4", frames * columns, at).reshape(frames, columns))
+            widths = *summed, *plain
+            _require(all(type(n) is int and 1 <= n <= 4 for n in widths), "planes must have 1 to 4 bytes", name)
+            weights.append(np.frombuffer(content, "<f4", frames * (1 + len(widths)), at).reshape(frames, -1))
             _require((np.abs(weights[-1]) <= LARGEST).all(), f"weights must be at most {LARGEST:g}", name)
             at += weights[-1].nbytes
+            sizes += [width * count for width in widths]
+    stream, lengths = (io.BytesIO(packed), parts) if parts else (io.BytesIO(content), [at, *sizes])
+    end = at + sum(sizes)
+    _require(end == entry["unpacked"] and len(content) == (at if parts else end), f"planes must fill {end} bytes", at)
+    following = iter(list(zip([stream.read(length) for length in lengths][1:], sizes, strict=True)))
     for array in arrays:
-        found[array["name"]] = track = []
-        for widths in array["planes"]:
-            planes = []
-            for size in (*widths[0], *widths[1]):
-                planes.append(_plane(content, at, count, size))
-                at += size * count
-            summed = np.empty((len(widths[0]), count), np.float32)
-            for plane, row in zip(planes, summed, strict=False):
-                row[:] = np.cumsum(plane, dtype=np.int32)
-            track.append(Component(weights.pop(0), summed, planes[len(summed) :]))
-    _require(at == len(content), f"planes must fill {len(content)} bytes", at)
+        track = found[array["name"]] = []
+        for summed, plain in array["planes"]:
+            planes = [partial(_plane, *next(following), width, bool(parts)) for width in (*summed, *plain)]
+            sums = [np.cumsum(unpack(), dtype=np.int32) for unpack in planes[: len(summed)]]
+            rows = np.array(sums, np.float32).reshape(len(summed), count)
+            track.append(Component(weights.pop(0), rows, planes[len(summed) :]))
     return found
 
 
-def _plane(content: bytes, at: int, count: int, size: int) -> NDArray[np.signedinteger]:
+def _plane(octets: bytes, size: int, width: int, is_packed: bool) -> NDArray[np.signedinteger]:
     """Return a plane: 0, 1, 2, 3, 4 … stand for 0, -1, 1, -2, 2 …; the bytes of each order stand together."""
-    octets = np.frombuffer(content, np.uint8, size * count, at).reshape(size, count)
-    kind = np.dtype(f"u{(1, 2, 4, 4)[size - 1]}")
-    numbers, one = octets[0].astype(kind), np.array(1, kind)
-    for order in range(1, size):
-        numbers |= octets[order].astype(kind) << np.array(8 * order, kind)
+    content = zlib.decompressobj(-zlib.MAX_WBITS).decompress(octets, size + 1) if is_packed else octets
+    _require(len(content) == size, f"a plane must have {size} bytes", len(content))
+    orders, kind = np.frombuffer(content, np.uint8).reshape(width, -1), np.dtype(f"u{(1, 2, 4, 4)[width - 1]}")
+    numbers, one = orders[0].astype(kind), np.array(1, kind)
+    for order in range(1, width):
+        numbers |= orders[order].astype(kind) << np.array(8 * order, kind)
     return ((numbers >> one) ^ -(numbers & one)).view(f"i{kind.itemsize}")
-
-
-def _values(track: Track, frame: int) -> Float32:
-    values = np.empty((len(track), track[0].summed.shape[1]), np.float32)
-    for component, row in zip(track, values, strict=True):
-        offset, first, last = np.split(component.weights[frame], [1, 1 + len(component.summed)])
-        np.einsum("s,sn->n", first, component.summed, out=row)  # of few rows, faster than a product of matrices
-        row += offset
-        for plane in np.flatnonzero(last):
-            row += component.plain[plane] * last[plane]
-    return values
 
 
 def activated(name: str, values: Float32) -> Float32:

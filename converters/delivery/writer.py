@@ -201,13 +201,20 @@ class Block:
     @classmethod
     def of(cls, name: str, frames: int, arrays: Mapping[str, list[Planes]], level: int) -> Block:
         """Pack the arrays of some frames by a level of zlib."""
-        content = block_bytes(frames, arrays)
-        packer = zlib.compressobj(level, zlib.DEFLATED, zlib.MAX_WBITS, MEMORY, zlib.Z_FILTERED)
-        packed = packer.compress(content) + packer.flush()
-        if len(content) > FREE_BYTES + MAX_RATIO * len(packed):  # nearly nothing in it: a decoder would refuse it
-            packed = zlib.compress(content, 0)
-        digest = hashlib.sha256(packed).hexdigest()
-        return cls({"file": name, "bytes": len(packed), "unpacked": len(content), "sha256": digest}, packed)
+        content = block_parts(frames, arrays)
+        packed, unpacked = _packed(content, level), sum(map(len, content))
+        if unpacked > FREE_BYTES + MAX_RATIO * sum(map(len, packed)):  # nearly nothing in it: a decoder would refuse it
+            packed = _packed(content, 0)
+        joined, parts = b"".join(packed), [len(part) for part in packed[:-1]]
+        digest = hashlib.sha256(joined).hexdigest()
+        entry = {"file": name, "bytes": len(joined), "unpacked": unpacked, "sha256": digest, "parts": parts}
+        return cls(entry, joined)
+
+
+def _packed(parts: Sequence[bytes], level: int) -> list[bytes]:
+    """Return a zlib stream in a part for each one that is given, which can be unpacked alone, and its end."""
+    packer = zlib.compressobj(level, zlib.DEFLATED, zlib.MAX_WBITS, MEMORY, zlib.Z_FILTERED)
+    return [*(packer.compress(part) + packer.flush(zlib.Z_FULL_FLUSH) for part in parts), packer.flush()]
 
 
 @dataclass
@@ -356,8 +363,8 @@ def _values(components: Sequence[Planes]) -> NDArray[np.float32]:
     return np.stack([each.values() for each in components], axis=1)
 
 
-def block_bytes(frames: int, arrays: Mapping[str, list[Planes]]) -> bytes:
-    """Return a block: the length of its header, the header, the weights of all arrays, and their planes."""
+def block_parts(frames: int, arrays: Mapping[str, list[Planes]]) -> list[bytes]:
+    """Return a block: the length of its header, the header, and the weights of all arrays; then each plane."""
     described, weights, planes = [], [], []
     for name, components in arrays.items():
         widths = []
@@ -370,4 +377,4 @@ def block_bytes(frames: int, arrays: Mapping[str, list[Planes]]) -> bytes:
         described.append({"name": name, "planes": widths})
     header = json.dumps({"arrays": described}, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 4)
-    return b"".join([struct.pack("<I", len(header)), header, *weights, *planes])
+    return [b"".join([struct.pack("<I", len(header)), header, *weights]), *planes]

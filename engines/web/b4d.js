@@ -6,33 +6,26 @@
  *     const frame = await take.frame(12);  // {positions: Float32Array(3 N), orientations: Float32Array(4 N), ...}
  */
 
-const MANIFEST = "manifest.json", HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26;
-const FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30;
+const HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26, FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30;
 const COMPONENTS = {positions: 3, orientations: 3, turns: 3, scales: 3, opacities: 1, base_color: 3, roughness: 1, ambient_occlusion: 1, normals: 3};
 for (let k = 0; k < 25; k++) COMPONENTS[`radiance_${k}`] = 3;
 
 /** A container breaks its format; the message names the file in it. */
 export class DeliveryError extends Error {}
 
-function require(condition, contract, got) {
-  if (!condition) throw new DeliveryError(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`);
-}
+const require = (condition, contract, got) => { if (!condition) throw new DeliveryError(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
-function whole(value, name, least, most) {
-  require(Number.isSafeInteger(value) && value >= least && value <= most, `${name} must be in [${least}, ${most}]`, value);
-  return value;
-}
+const whole = (value, name, least, most) =>
+  (require(Number.isSafeInteger(value) && value >= least && value <= most, `${name} must be in [${least}, ${most}]`, value), value);
 
 /** Reads ranges of a file at a URL; a server without ranges sends the whole file, of which the range is taken. */
-function rangesOf(url) {
-  return async (name, start, size, signal) => {
-    const place = name === null ? url : new URL(name, new URL(url, globalThis.location?.href));
-    const answer = await fetch(place, {signal, headers: {Range: `bytes=${start}-${start + size - 1}`}});
-    require(answer.ok, `${name ?? url} must be within reach`, answer.status);
-    const content = new Uint8Array(await answer.arrayBuffer());
-    return answer.status === 206 ? content : content.subarray(start, start + size);
-  };
-}
+const rangesOf = (url) => async (name, start, size, signal) => {
+  const place = name === null ? url : new URL(name, new URL(url, globalThis.location?.href));
+  const answer = await fetch(place, {signal, headers: {Range: `bytes=${start}-${start + size - 1}`}});
+  require(answer.ok, `${name ?? url} must be within reach`, answer.status);
+  const content = new Uint8Array(await answer.arrayBuffer());
+  return answer.status === 206 ? content : content.subarray(start, start + size);
+};
 
 /** A take that is open for playing. */
 export class Take {
@@ -47,31 +40,25 @@ export class Take {
     let content = await read(null, 0, HEAD_BYTES);
     if (take.isArchive) {
       const head = new DataView(content.buffer, content.byteOffset, content.byteLength);
-      const isZip = content.length >= 30 && head.getUint32(0, true) === 0x04034b50;
-      require(isZip && head.getUint16(8, true) === 0, "a b4d file must be a zip archive, stored", [...content.slice(0, 4)]);
+      require(content.length >= 30 && head.getUint32(0, true) === 0x04034b50 && head.getUint16(8, true) === 0, "a b4d file must be a zip archive, stored", [...content.slice(0, 4)]);
       const size = head.getUint32(18, true), at = 30 + head.getUint16(26, true) + head.getUint16(28, true);
       take.start = at + size;
       if (take.start > content.length) content = await read(null, 0, take.start);
       content = content.subarray(at, take.start);
     } else if (content.length === HEAD_BYTES) content = await read(null, 0, MAX_MANIFEST_BYTES);
-    try {
-      take.manifest = JSON.parse(new TextDecoder().decode(content));
-    } catch (error) {
-      throw new DeliveryError(`${MANIFEST} must be JSON, got ${error.message}.`);
-    }
+    take.manifest = await new Response(content).json().catch((error) => { throw new DeliveryError(`manifest.json must be JSON, got ${error.message}.`); });
     check(take.manifest);
     const tracks = await take.tracks(take.manifest.static, 1);
-    const missing = ["positions", "orientations", "scales", "opacities"].filter((name) => !(name in tracks));
-    require(!missing.length, "the static block must hold positions, orientations, scales and opacities", missing);
-    take.raw = mapped(tracks, (track) => valuesAt(track, 0, take.manifest.count, null));
+    for (const name of ["positions", "orientations", "scales", "opacities"]) require(name in tracks, `the static block must hold ${name}`, Object.keys(tracks));
+    take.none = new Float32Array(take.manifest.count);
+    take.raw = mapped(tracks, (track) => valuesAt(track, 0, take.none, null, new Float32Array(track.length * take.none.length)));
     take.still = mapped(take.raw, (values, name) => activated(name, values.slice()));
     return take;
   }
 
   /** Open a `.b4d` file that is at hand: its bytes, or a Blob; a page needs no server for it. */
-  static from(content) {
-    const part = (start, size) => new Blob([content]).slice(start, start + size).arrayBuffer();
-    return Take.open("bytes.b4d", async (_, start, size) => new Uint8Array(await part(start, size)));
+  static from(content, file = new Blob([content])) {
+    return Take.open("bytes.b4d", async (_, start, size) => new Uint8Array(await file.slice(start, start + size).arrayBuffer()));
   }
 
   /**
@@ -80,29 +67,45 @@ export class Take {
    * @param {number} frames
    * @param {(block: object) => Promise<object>} [unpack] What `unpacking` returns, perhaps in a worker.
    * @param {AbortSignal} [signal] Ends the request early.
+   * @param {{packed: Uint8Array}} [held] Keeps the bytes; no request is made for those that it has.
    */
-  async tracks(entry, frames, unpack = unpacking(), signal = undefined) {
+  async tracks(entry, frames, unpack = unpacking(), signal = undefined, held = {}) {
     const [name, start] = this.isArchive ? [null, this.start + entry.offset] : [entry.file, 0];
-    const packed = await this.read(name, start, entry.bytes, signal);
-    const {tracks} = await unpack({packed, entry, frames, count: this.manifest.count}).catch((error) => { throw new DeliveryError(error.message); });
+    held.packed ??= await this.read(name, start, entry.bytes, signal);
+    const {tracks} = await unpack({packed: held.packed, entry, frames, count: this.manifest.count}).catch((error) => { throw new DeliveryError(error.message); });
     for (const [array, {length}] of Object.entries(tracks)) require(length === COMPONENTS[array], `${entry.file} must hold arrays that are known`, array);
     return tracks;
   }
 
-  /** Return a frame; its segment is fetched and unpacked if it is not the one of the last call. */
-  async frame(number) {
+  /**
+   * Return a frame; its segment is fetched if it is not the one of the last call, and of its planes those are unpacked that
+   * the frame needs, if they have not been.
+   * @param {number} number
+   * @param {object} [into] As for `frameOf`.
+   */
+  async frame(number, into = {}) {
     whole(number, "frame", 0, this.manifest.frames - 1);
-    const entry = this.manifest.segments.find(({first, frames}) => number < first + frames);
-    if (this.unpacked?.entry !== entry) this.unpacked = {entry, tracks: await this.tracks(entry, entry.frames)};
-    return this.frameOf(this.unpacked.tracks, number - entry.first);
+    const entry = this.manifest.segments.find(({first, frames}) => number < first + frames), frame = number - entry.first;
+    const held = this.held?.entry === entry ? this.held : {entry}, unpack = (block) => unpacking()({...block, frame, tracks: held.tracks});
+    this.held = Object.assign(held, {tracks: await this.tracks(entry, entry.frames, unpack, undefined, held)});
+    return this.frameOf(held.tracks, frame, into);
   }
 
-  /** Return a frame of a segment whose tracks are at hand; arrays that do not change are shared between frames. */
-  frameOf(tracks, frame) {
-    const count = this.manifest.count, found = {...this.still};
-    const {turns, ...values} = mapped(tracks, (track, name) => valuesAt(track, frame, count, this.raw[name]));
-    for (const name of Object.keys(values)) found[name] = turns && name === "normals" ? values[name] : activated(name, values[name]);
-    return turns ? turn(found, turns, count, values.normals) : found;
+  /**
+   * Return a frame of a segment whose tracks are at hand; arrays that do not change are shared between frames.
+   * @param {object} tracks
+   * @param {number} frame Counted from the first one of the segment.
+   * @param {object} [into] A frame that is not needed any more: its arrays are written over, which takes less time than new ones.
+   */
+  frameOf(tracks, frame, into = {}) {
+    const {turns, ...others} = tracks, {count} = this.manifest, found = {...this.still};
+    const room = (name, rows) => (into[name]?.length === rows * count && into[name] !== this.still[name] ? into[name] : new Float32Array(rows * count));
+    const sums = (name, values) => valuesAt(tracks[name], frame, this.none, this.raw[name], values ?? room(name, tracks[name].length));
+    for (const name of Object.keys(others)) found[name] = turns && name === "normals" ? sums(name) : activated(name, sums(name));
+    if (!turns) return found;
+    this.turns = sums("turns", this.turns ?? new Float32Array(3 * count));
+    const {orientations, normals} = found, turned = others.normals ? normals : normals && room("normals", 3);
+    return Object.assign(found, {orientations: turn(this.turns, count, orientations, room("orientations", 4), normals, turned)}, normals && {normals: turned});
   }
 }
 
@@ -117,144 +120,158 @@ function check(said) {
     whole(entry.unpacked, "unpacked", 4, Math.min(FREE_BYTES + MAX_RATIO * whole(entry.bytes, "bytes", 1, 2 ** 40), 2 ** 31));
   }
   whole(said.count, "count", 0, FREE_COUNT + said.static.bytes);
-  let following = 0;
-  for (const {first, frames} of said.segments) following = whole(first, "first", following, following) + whole(frames, "frames", 1, MAX_FRAMES);
+  const following = said.segments.reduce((at, {first, frames}) => whole(first, "first", at, at) + whole(frames, "frames", 1, MAX_FRAMES), 0);
   whole(said.frames, "frames", Math.max(following, 1), following);
 }
 
 /**
  * Return the function that unpacks a block, given its bytes, its entry in the manifest, its number of frames, and of
- * Gaussians. A worker can run this one: it uses nothing outside of itself. `transfer` lists the memory of the answer.
+ * Gaussians; with a `frame`, only the planes that it needs, where the block has parts, beside those in `tracks`, which an
+ * earlier call gave. A worker can run this one: it uses nothing outside of itself. `transfer` lists the memory of the answer.
  */
 export function unpacking() {
+  const zlib = globalThis.process?.getBuiltinModule?.("node:zlib"); // the streams of Node.js take four times as long
   const must = (condition, contract, got) => { if (!condition) throw new Error(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
-  /** Put 0, -1, 1, -2, 2 … where octets 0, 1, 2, 3, 4 … stand: four at a time, but for those before and after whole words. */
+  /** Put 0, -1, 1, -2, 2 … where octets 0, 1, 2, 3, 4 … stand: four words at a time, but for those before and after. */
   function signed({buffer, byteOffset, length}) {
-    const head = Math.min(-byteOffset & 3, length), tail = length - ((length - head) & 3), numbers = new Int8Array(buffer, byteOffset, length);
-    const words = new Uint32Array(buffer, byteOffset + head, (tail - head) / 4);
-    for (let k = 0; k < words.length; k++) words[k] = ((words[k] >>> 1) & 0x7f7f7f7f) ^ (255 * (words[k] & 0x01010101));
-    for (let i = head ? 0 : tail; i < length; i = i + 1 === head ? tail : i + 1) numbers[i] = ((numbers[i] & 255) >>> 1) ^ -(numbers[i] & 1);
+    const head = Math.min(-byteOffset & 3, length), tail = length - ((length - head) & 15), numbers = new Int8Array(buffer, byteOffset, length);
+    const words = new Int32Array(buffer, byteOffset + head, (tail - head) / 4), change = (w) => ((w >>> 1) & 0x7f7f7f7f) ^ Math.imul(255, w & 0x01010101);
+    for (let k = 0; k < words.length; k = k + 4 | 0) {
+      const l = k + 1 | 0, m = k + 2 | 0, n = k + 3 | 0;
+      words[k] = change(words[k]), words[l] = change(words[l]), words[m] = change(words[m]), words[n] = change(words[n]);
+    }
+    for (let i = head ? 0 : tail; i < length; i = i + 1 === head ? tail : i + 1) numbers[i] = change(numbers[i] & 255);
     return numbers;
   }
 
-  /** Return the whole numbers of a plane, in its own place if they are octets. Loops that meet one kind of array are fast. */
+  /** Return the whole numbers of a plane, in its own place if they are octets. */
   function plane(octets, count, size, isSummed) {
     if (size === 1 && !isSummed) return signed(octets);
-    const [a, b, c, d] = [0, 1, 2, 3].map((k) => octets.subarray(k < size ? k * count : 0)), [m, n, o] = [2, 3, 4].map((k) => (k <= size ? -1 : 0));
-    const numbers = new Float32Array(count), kept = isSummed ? -1 : 0; // all bits of the sum so far, or none
-    if (size < 3) for (let i = 0, sum = 0; i < count; i++) {
-      const code = a[i] | b[i] << 8 & m;
-      numbers[i] = sum = ((sum & kept) + ((code >>> 1) ^ -(code & 1))) | 0;
-    } else for (let i = 0, sum = 0; i < count; i++) {
-      const code = a[i] | b[i] << 8 | c[i] << 16 & n | d[i] << 24 & o;
-      numbers[i] = sum = ((sum & kept) + ((code >>> 1) ^ -(code & 1))) | 0;
+    const rest = (_, i) => octets[count + i] | octets[2 * count + i] << 8 | (size > 3 && octets[3 * count + i]) << 16;
+    const upper = size > 2 ? Int32Array.from({length: count}, rest) : octets.subarray(size > 1 ? count : 0);
+    const numbers = new Float32Array(count), kept = isSummed ? -1 : 0, mask = size > 1 ? -1 : 0; // all bits, or none
+    for (let i = 0, sum = 0; i < count; i = i + 1 | 0) {
+      const code = octets[i] | (upper[i] & mask) << 8;
+      numbers[i] = sum = (sum & kept) + (code >>> 1 ^ -(code & 1)) | 0;
     }
     return numbers;
   }
 
-  function split(content, frames, count) {
-    const tracks = {};
-    let at = 4 + new DataView(content.buffer).getUint32(0, true);
-    for (const {name, planes} of JSON.parse(new TextDecoder().decode(content.subarray(4, at))).arrays) {
-      tracks[name] = planes.map(([summed, plain]) => {
-        const columns = 1 + summed.length + plain.length, weights = new Float32Array(content.slice(at, at += 4 * frames * columns).buffer);
-        must(weights.every((w) => Math.abs(w) <= 1e6), "weights must be at most 1e6", name);
-        return {sizes: [...summed, ...plain], first: summed.length, columns, weights};
-      });
-    }
-    const components = Object.values(tracks).flat();
-    for (const component of components) component.planes = component.sizes.map((size, k) => {
-      must(size >= 1 && size <= 4 && at + size * count <= content.length, "it must hold all planes, of 1 to 4 bytes a number", size);
-      return plane(content.subarray(at, at += size * count), count, size, k < component.first);
+  /** Return the tracks that a block describes, without planes, and where those begin. */
+  function described(content, frames, count, unpacked) {
+    let tracks = {}, at = 4 + new DataView(content.buffer, content.byteOffset).getUint32(0, true), end = 0;
+    for (const {name, planes} of JSON.parse(new TextDecoder().decode(content.subarray(4, at))).arrays) tracks[name] = planes.map(([summed, plain]) => {
+      const sizes = [...summed, ...plain], columns = 1 + sizes.length, weights = new Float32Array(content.slice(at, at += 4 * frames * columns).buffer);
+      must(sizes.every((size) => [1, 2, 3, 4].includes(size)) && weights.every((w) => Math.abs(w) <= 1e6), "planes must have 1 to 4 bytes, and weights at most 1e6", name);
+      end += sizes.reduce((sum, size) => sum + size * count, 0);
+      return {sizes, first: summed.length, columns, weights, planes: []};
     });
-    must(at === content.length, "it must be filled by its planes", at);
-    return {tracks, transfer: [...new Set(components.flatMap(({planes}) => planes.map(({buffer}) => buffer)))]};
+    must(at <= content.length && at + end === unpacked, `planes must fill ${unpacked} bytes`, at + end);
+    return {tracks, at};
   }
 
-  /** Return what a stream unpacks to; an error if it is damaged, or not as long as it should be. */
-  async function inflated(packed, size) {
-    const stream = new DecompressionStream("deflate"), writer = stream.writable.getWriter(), reader = stream.readable.getReader(), content = new Uint8Array(size);
-    Promise.all([writer.write(packed), writer.close()]).catch(() => {}); // the reader meets it too
-    let end = 0;
+  /** Return what pieces of a stream unpack to; an error if it is damaged, or longer than it may be. */
+  async function inflated(pieces, most, isRaw) {
+    if (zlib) return new Promise((resolve, reject) => zlib[isRaw ? "inflateRaw" : "inflate"](Buffer.concat(pieces), {chunkSize: most + 4096, maxOutputLength: most + 1},
+      (error, {buffer, byteOffset, length} = {}) => (error ? reject(error) : resolve(new Uint8Array(buffer, byteOffset, length)))));
+    const stream = new DecompressionStream(isRaw ? "deflate-raw" : "deflate"), writer = stream.writable.getWriter(), reader = stream.readable.getReader();
+    Promise.all([...pieces.map((piece) => writer.write(piece)), writer.close()]).catch(() => {}); // the reader meets it too
+    let content = new Uint8Array(most), end = 0;
     for (let part; !(part = await reader.read()).done; end += part.value.length) content.set(part.value, end);
-    return end === size ? content : new Error(`${end}`);
+    return content.subarray(0, end);
   }
 
-  return async ({packed, entry: {file, bytes, unpacked, sha256}, frames, count}) => {
+  return async ({packed, entry: {file, bytes, unpacked, sha256, parts}, frames, count, frame, tracks}) => {
     must(packed.length === bytes, `${file} must have ${bytes} bytes`, packed.length);
-    const digest = globalThis.crypto?.subtle?.digest("SHA-256", packed); // pages from http have none
-    const content = await inflated(packed, unpacked).catch((error) => error);
-    const digits = digest && Array.from(new Uint8Array(await digest), (byte) => byte.toString(16).padStart(2, "0")).join("");
-    must(!digest || digits === sha256, `${file} must have the digest that the manifest says`, digits);
-    must(content instanceof Uint8Array, `${file} must unpack to ${unpacked} bytes`, content.message);
+    const digest = !tracks && await globalThis.crypto?.subtle?.digest("SHA-256", packed); // pages from http have none
+    const digits = digest ? Array.from(new Uint8Array(digest), (byte) => byte.toString(16).padStart(2, "0")).join("") : sha256;
+    must(digits === sha256, `${file} must have the digest that the manifest says`, digits);
     try {
-      return split(content, frames, count);
+      const isWhole = !parts || frame === undefined, end = Uint8Array.of(3, 0), wanted = [];
+      let content, at, start = parts?.[0], part = 0;
+      if (!tracks) {
+        content = await (isWhole ? inflated([packed], unpacked) : inflated([packed.subarray(2, start), end], unpacked, true));
+        ({tracks, at} = described(content, frames, count, unpacked));
+      }
+      const components = Object.values(tracks).flat();
+      for (const {sizes, first, columns, weights, planes} of components) sizes.forEach((size, k) => {
+        must(isWhole || parts[++part] > 0, "parts must be as many as planes", parts?.[part]);
+        const piece = isWhole ? null : packed.subarray(start, start += parts[part]), isSummed = k < first;
+        if (!planes[k] && (isWhole || isSummed || weights[frame * columns + 1 + k])) wanted.push({piece, planes, k, size, isSummed});
+      });
+      const sum = wanted.reduce((before, {size}) => before + size * count, 0);
+      if (!isWhole) [content, at] = [await inflated([...wanted.map(({piece}) => piece), end], sum, true), 0];
+      must(!wanted.length || content.length === at + sum, "planes must be as long as they say", content?.length);
+      for (const {planes, k, size, isSummed} of wanted) planes[k] = plane(content.subarray(at, at += size * count), count, size, isSummed);
+      return {tracks, transfer: [...new Set(components.flatMap(({planes}) => planes.map(({buffer}) => buffer)))]};
     } catch (error) {
       throw new Error(`${file} must be a sound block, got: ${error.message}`);
     }
   };
 }
 
-/** Return offset plus weights times planes for each component, plus what the static block says. */
-function valuesAt(track, frame, count, start) {
-  const values = new Float32Array(track.length * count), none = new Int8Array(count);
+/** Return offset plus weights times planes for each component, plus what the static block says; `none` is a row of zeros. */
+function valuesAt(track, frame, none, start, values) {
+  const count = none.length;
   track.forEach(({columns, weights, planes}, c) => {
     const part = (all) => all.subarray(c * count, (c + 1) * count), out = part(values), at = frame * columns;
-    const used = planes.map((numbers, k) => [numbers, weights[at + 1 + k]]).filter(([, weight]) => weight);
-    const [wide, octets] = [Float32Array, Int8Array].map((kind) => used.filter(([numbers]) => numbers instanceof kind));
+    const [wide, octets] = [Float32Array, Int8Array].map((kind) => planes.flatMap((row, k) => (row instanceof kind && weights[at + 1 + k] ? [[row, weights[at + 1 + k]]] : [])));
     if (start) wide.unshift([part(start), 1]);
-    for (let offset = weights[at], isFirst = true; isFirst || wide.length || octets.length; offset = 0, isFirst = false) {
-      if (!isFirst) wide.unshift([out, 1]);
-      const [add, most] = wide.length > 2 ? [addFour, 4] : [addTwo, 2];
-      add(out, offset, ...(octets.shift() ?? [none, 0]), ...Array.from({length: most}, () => wide.shift() ?? [out, 0]).flat());
-    }
+    const next = () => wide.shift() ?? [none, 0]; // a row and its weight
+    putSum(out, weights[at], ...(octets.shift() ?? [new Int8Array(none.buffer), 0]), ...next(), ...next());
+    for (const octet of octets) putSum(out, 0, ...octet, out, 1, ...next());
+    while (wide.length) addTwo(out, ...next(), ...next());
   });
   return values;
 }
 
-const addTwo = (out, offset, o, w, a, p, b, q) => { for (let i = 0; i < out.length; i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i]; };
-const addFour = (out, offset, o, w, a, p, b, q, c, r, d, s) => { for (let i = 0; i < out.length; i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i] + r * c[i] + s * d[i]; };
+/** Put an offset, weighted octets and two weighted rows; eight numbers at a time, which takes three fifths of the time. */
+function putSum(out, offset, o, w, a, p, b, q) {
+  let i = 0, count = out.length;
+  for (; i < (count & 7); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i];
+  for (; i < count; i = i + 8 | 0) {
+    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
+    out[i] = offset + w * o[i] + p * a[i] + q * b[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j];
+    out[k] = offset + w * o[k] + p * a[k] + q * b[k], out[l] = offset + w * o[l] + p * a[l] + q * b[l];
+    out[m] = offset + w * o[m] + p * a[m] + q * b[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n];
+    out[r] = offset + w * o[r] + p * a[r] + q * b[r], out[s] = offset + w * o[s] + p * a[s] + q * b[s];
+  }
+}
+
+/** Add two weighted rows, in the same way. */
+function addTwo(out, a, p, b, q) {
+  let i = 0, count = out.length;
+  for (; i < (count & 7); i++) out[i] += p * a[i] + q * b[i];
+  for (; i < count; i = i + 8 | 0) {
+    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
+    out[i] += p * a[i] + q * b[i], out[j] += p * a[j] + q * b[j], out[k] += p * a[k] + q * b[k], out[l] += p * a[l] + q * b[l];
+    out[m] += p * a[m] + q * b[m], out[n] += p * a[n] + q * b[n], out[r] += p * a[r] + q * b[r], out[s] += p * a[s] + q * b[s];
+  }
+}
 
 /** Turn numbers of an array into what they stand for, in place where that is possible. */
 function activated(name, values) {
-  const count = values.length / COMPONENTS[name], isColor = name !== "positions" && !name.startsWith("radiance");
-  if (name === "orientations") return quaternions(values, count);
-  if (name === "scales") {
-    for (let i = 0; i < values.length; i++) values[i] = values[i] < -29 ? 0 : Math.exp(Math.min(values[i], 20));
-  } else if (name === "normals") {
-    for (let i = 0, j = count, k = 2 * count; i < count; i++, j++, k++) {
-      const x = values[i], y = values[j], z = values[k], share = 1 / Math.max(Math.sqrt(x * x + y * y + z * z), 1e-12);
-      values[i] = x * share, values[j] = y * share, values[k] = z * share;
-    }
-  } else if (isColor) {
-    for (let i = 0; i < values.length; i++) values[i] = values[i] < 0 ? 0 : values[i] > 1 ? 1 : values[i];
-  }
+  const count = values.length / COMPONENTS[name], none = () => new Float32Array(4 * count), isColor = name !== "positions" && !name.startsWith("radiance");
+  if (name === "orientations") return turn(values, count, none().fill(1, 3 * count), none());
+  if (name === "normals") turn(none(), count, none(), none(), values, values);
+  else if (name === "scales") for (let i = 0; i < values.length; i++) values[i] = values[i] < -29 ? 0 : Math.exp(Math.min(values[i], 20));
+  else if (isColor) for (let i = 0; i < values.length; i = i + 1 | 0) if (values[i] < 0) values[i] = 0; else if (values[i] > 1) values[i] = 1;
   return values;
 }
 
-/** Return the unit quaternions xyzw of modified Rodrigues parameters, axis times tan(angle / 4). */
-function quaternions(values, count) {
-  const found = new Float32Array(4 * count);
-  for (let i = 0, j = count, k = 2 * count, l = 3 * count; i < count; i++, j++, k++, l++) {
-    const x = values[i], y = values[j], z = values[k], square = x * x + y * y + z * z, share = 1 / (1 + square);
-    found[i] = 2 * x * share, found[j] = 2 * y * share, found[k] = 2 * z * share, found[l] = (1 - square) * share;
-  }
-  return found;
-}
-
-/** Turn orientations, and normals where there are any, by modified Rodrigues parameters; normals may have any length (`own`: in place). */
-function turn(arrays, turns, count, own) {
-  const from = arrays.orientations, to = new Float32Array(4 * count), normals = arrays.normals, turned = own ?? (normals && new Float32Array(3 * count));
-  for (let i = 0, j = count, k = 2 * count, l = 3 * count; i < count; i++, j++, k++, l++) {
-    const e = turns[i], f = turns[j], g = turns[k], s = e * e + f * f + g * g, share = 1 / (1 + s), two = share + share;
-    const a = e * two, b = f * two, c = g * two, d = (1 - s) * share, x = from[i], y = from[j], z = from[k], w = from[l];
-    to[i] = d * x + a * w + b * z - c * y, to[j] = d * y + b * w + c * x - a * z;
-    to[k] = d * z + c * w + a * y - b * x, to[l] = d * w - a * x - b * y - c * z;
-    if (!normals) continue;
-    const u = normals[i], v = normals[j], n = normals[k], unit = 1 / Math.max(Math.sqrt(u * u + v * v + n * n), 1e-12);
+/**
+ * Put quaternions xyzw turned by modified Rodrigues parameters, axis times tan(angle / 4), and unit normals turned by them;
+ * normals may have any length, and may be turned in place. All is read before anything is written, which takes less time.
+ */
+function turn(turns, count, from, to, normals = turns, turned = new Float32Array(3 * count)) {
+  for (let i = 0; i < count; i = i + 1 | 0) {
+    const j = i + count | 0, k = j + count | 0, l = k + count | 0, e = turns[i], f = turns[j], g = turns[k], share = 2 / (1 + e * e + f * f + g * g);
+    const a = e * share, b = f * share, c = g * share, d = share - 1, x = from[i], y = from[j], z = from[k], w = from[l];
+    const u = normals[i], v = normals[j], n = normals[k], unit = 1 / Math.sqrt(u * u + v * v + n * n + 1e-24);
     const p = 2 * (b * n - c * v), q = 2 * (c * u - a * n), r = 2 * (a * v - b * u);
+    to[i] = d * x + a * w + b * z - c * y, to[j] = d * y + b * w + c * x - a * z, to[k] = d * z + c * w + a * y - b * x, to[l] = d * w - a * x - b * y - c * z;
     turned[i] = unit * (u + d * p + b * r - c * q), turned[j] = unit * (v + d * q + c * p - a * r), turned[k] = unit * (n + d * r + a * q - b * p);
   }
-  return Object.assign(arrays, {orientations: to}, normals && {normals: turned});
+  return to;
 }

@@ -10,7 +10,7 @@ from scipy.stats import binom
 from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.evaluate.certificate import KEY, Certificate, least_bound, least_share
 from beam_warp.evaluate.relit import loss_of
-from beam_warp.evaluate.trials import RelitTrials
+from beam_warp.evaluate.trials import DIMMED, RelitTrials
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
@@ -118,6 +118,15 @@ class TestTrials:
         height = np.sin(np.radians([draw.elevation for draw in draws]))
         low, high = np.sin(np.radians([-20.0, 75.0]))
         assert height.mean() == pytest.approx((low + high) / 2, abs=4.0 * (high - low) / np.sqrt(12 * 4000))
+
+    def test_irradiance_is_integrated_once_for_each_light(self, monkeypatch):
+        """What exposes a light also shades by it, exposed and dimmed."""
+        made, integrate = [], EnvironmentMap.irradiance_map
+        monkeypatch.setattr(EnvironmentMap, "irradiance_map", lambda *given: made.append(given) or integrate(*given))
+        white, *_, dim = RelitTrials([EnvironmentMap.constant((2.0, 1.0, 1.0)), GREY.resized(8, 16)]).prepared
+        whitest, dimmest = (light.environment.default_irradiance.max() for light in (white, dim))
+        assert dimmest == pytest.approx(DIMMED * whitest)
+        assert len(made) == 2
 
     @pytest.mark.parametrize("lights", [[], [GREY] * 5, [EnvironmentMap.constant((0.0, 0.0, 0.0))]])
     def test_no_light_and_too_many_are_refused(self, lights):

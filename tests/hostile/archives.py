@@ -305,7 +305,9 @@ DELIVERY_FREE = frozenset(
 )
 
 
-def _repacked(content: bytes, name: str, packed: bytes, unpacked: int | None = None, **said: Any) -> bytes:
+def _repacked(
+    content: bytes, name: str, packed: bytes, unpacked: int | None = None, parts: Any = None, **said: Any
+) -> bytes:
     """Return a container with another block, of which the manifest says what is true, but for what is given."""
     files = unzipped(content)
     manifest = json.loads(files["manifest.json"])
@@ -313,6 +315,7 @@ def _repacked(content: bytes, name: str, packed: bytes, unpacked: int | None = N
     was = len(files[name])
     entry |= {"bytes": len(packed), "sha256": hashlib.sha256(packed).hexdigest()}
     entry["unpacked"] = len(zlib.decompress(packed)) if unpacked is None else unpacked
+    entry["parts"] = parts
     for other in manifest["segments"]:
         other["offset"] += len(packed) - was if name == "static.bin" else 0
     files[name] = packed
@@ -351,6 +354,21 @@ def _deliveries(content: bytes) -> Iterator[Case]:
         for label, arrays in (("unknown", [{"name": "a", "planes": []}]), ("twice", 2 * header["arrays"]), ("none", 0)):
             other = _with_header(block, json.dumps({"arrays": arrays}).encode())
             yield Case(f"{name} with arrays {label}", _repacked(content, name, zlib.compress(other)))
+        files = unzipped(content)
+        manifest = json.loads(files["manifest.json"])
+        (sizes,) = (e["parts"] for e in (manifest["static"], *manifest["segments"]) if e["file"] == name)
+        head, rest, size = files[name][: sizes[0]], files[name][sizes[0] :], len(block)
+        last = zlib.compressobj(9, zlib.DEFLATED, -15)
+        burst = last.compress(bytes(BOMB_BYTES)) + last.flush()
+        yield Case(
+            f"{name} with a part that is a bomb",
+            _repacked(content, name, head + burst + rest, size, [sizes[0], len(burst), *sizes[2:]]),
+        )
+        lies = {"fewer": sizes[:-1], "more": [*sizes, 0], "moved": [sizes[0], sizes[1] - 1, *sizes[2:]]}
+        lies |= {repr(parts): parts for parts in ([-1], [2**70], ["1"], {}, 3, "ab")}
+        for label, parts in lies.items():  # {}: nothing is said of parts, the block is one
+            said = _repacked(content, name, files[name], size, parts)
+            yield Case(f"{name} with parts {label}", said, is_fatal=parts != {})
     static = unzipped(content)["static.bin"]
     for count in (0, 1, 2**18, 2**31, -1, 3.0, True):
         yield Case(f"count {count}", _repacked(content, "static.bin", static, count=count))

@@ -43,7 +43,7 @@ def test_the_parser_reads_what_python_reads(dump, tmp_path, name):
         for array, track in container.tracks(entry, entry.get("frames", 1)).items():
             for c, component in enumerate(track):
                 part = f"{entry['file'].removesuffix('.bin')}.{array}{c}"
-                planes = [*component.summed, *component.plain]
+                planes = [*component.summed, *(unpack() for unpack in component.plain)]
                 assert (found.pop(f"{part}.weights") == component.weights.ravel()).all(), part
                 theirs = found.pop(f"{part}.planes")
                 assert len(theirs) == sum(map(len, planes)), part

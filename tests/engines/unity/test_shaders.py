@@ -125,7 +125,9 @@ def numbers(container, frame):
     entry = next(each for each in manifest["segments"] if frame < each["first"] + each["frames"])
     for block, at in ((manifest["static"], 0), (entry, frame - entry["first"])):
         for name, track in container.tracks(block, block.get("frames", 1)).items():
-            found[name] = found.get(name, 0.0) + decoder._values(track, at)
+            rows = found.setdefault(name, np.zeros((len(track), manifest["count"]), np.float32))
+            for component, row in zip(track, rows, strict=True):
+                component.add(at, row)
     return found
 
 
