@@ -10,8 +10,12 @@ Scored only, each row the walker's first frame: ``rade`` has others' choices, ma
 last of these with as many steps as they state; ``variants`` makes 3DGS's way of drawing ours one by one; ``gaussians``
 and ``cameras`` vary the number of either.
 
+``strides`` leaves frames of the walker out: one of two, three of four, all but the first and last. What each tracks is
+scored with and without asking silhouettes where joints have gone, beside how far the true surface moves.
+
 ``--keep DIR`` writes the sequences of ``captures`` as ``DIR/NAME/gaussians.usda``, for benchmarks that need them.
-``--quick`` takes the demo's capture and few Gaussians: does all of it run? Images are read before the clock starts;
+``--small`` is what a CPU can do: few Gaussians, a sample a pixel, a draft for the key frame. ``--quick`` takes the
+demo's capture and few Gaussians: does all of it run? Images are read before the clock starts;
 scores and meshes are made after it stops. A section that fails says so in its place, and the program returns 1.
 """
 
@@ -19,6 +23,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import itertools
 import os
 import sys
 import tempfile
@@ -44,6 +49,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.joint_tracking import JointOptions
+from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, truth_frames
 from beam_warp.reconstruction.targets import MOST_SAMPLES
 from beam_warp.reconstruction.track import TrackOptions
@@ -73,6 +79,7 @@ class Effort:
         large_tracked: Its tracked frames.
         samples: Paths per pixel of what is path traced here.
         surface_samples: Points on each surface of a Chamfer distance.
+        strides: Frames of ``strides`` from one that is tracked to the next.
         fitting: Changes of our defaults.
         tracking: How frames are tracked.
     """
@@ -88,6 +95,7 @@ class Effort:
     large_tracked: int = 8
     samples: int = 32
     surface_samples: int = SAMPLE_COUNT
+    strides: tuple[int, ...] = (1, 2, 4)
     fitting: Row = field(default_factory=dict)
     tracking: TrackOptions = field(default_factory=TrackOptions)
 
@@ -96,6 +104,8 @@ BRIEF = TrackOptions(
     joints=JointOptions(levels=(2,), iterations=(4,)),
     refinement=replace(TrackOptions().refinement, normal_iterations=4),
 )
+SMALL = Effort(gaussians=6_000, fitting={"samples": 1, "color_iterations": 150, "normal_iterations": 300})
+
 QUICK = Effort(
     gaussians=2_000,
     counts=(1_000,),
@@ -108,6 +118,7 @@ QUICK = Effort(
     large_tracked=3,
     samples=2,
     surface_samples=2_000,
+    strides=(1,),
     fitting={"color_iterations": 8, "normal_iterations": 8, "refine_every": 4},
     tracking=BRIEF,
 )
@@ -235,6 +246,49 @@ def measure_captures(bench: Bench) -> Iterator[Row]:
             )
         rows.append(row)
         yield {"rows": rows}
+
+
+def measure_strides(bench: Bench) -> Iterator[Row]:
+    """Yield how frames follow of which more and more before them are left out, silhouettes asked and not."""
+    capture, device, tracking = bench.capture, bench.device, bench.effort.tracking
+    bench.warm(capture)
+    known = truth_frames(capture)
+    last = known[-1] if len(known) > 1 else capture.frames[-1]
+    cameras = [record.camera for record in capture.select(split="train", frames=known[:1])]
+    key = next(bench.follow(bench.make(bench.fitting, tracking), capture, known[:1]))
+    rows: list[Row] = []
+    for stride in bench.effort.strides:
+        frames = range(known[0], last + 1, stride)
+        meshes = [read_truth_mesh(capture, frame) for frame in frames]
+        motion = [motion_in_pixels(*(m.vertices for m in pair), cameras) for pair in itertools.pairwise(meshes)]
+        for asked in (False, True):
+            options = tracking if asked else replace(tracking, reach=np.inf)
+            contender = bench.make(bench.fitting, options)
+            modelled = [key, *follow(contender, capture, frames[1:], device, track=key.track)]
+            vertices = (mesh.vertices for mesh in meshes)
+            drift = tracking_drift(
+                (entry.cloud for entry in modelled), vertices, meshes[0].faces, cameras=cameras, device=device.alias
+            )
+            row: Row = {"stride": stride, "silhouettes": asked, "gaussians": len(key.cloud)}
+            row["motion"] = dict(zip(("median", "p95", "largest"), np.quantile(motion, (0.5, 0.95, 1.0)), strict=True))
+            row["frames"] = [
+                {
+                    "frame": entry.frame,
+                    "seconds": entry.seconds,
+                    "training_psnr": entry.report["psnr"],
+                    "start": entry.report.get("start", ""),
+                    "lost": entry.report.get("lost", ""),
+                    "drift": moved.as_dict(),
+                    **(
+                        {"psnr": bench.psnr(entry, capture, contender.options, entry.samples)}
+                        if entry.frame in known
+                        else {}
+                    ),
+                }
+                for entry, moved in zip(modelled, drift, strict=True)
+            ]
+            rows.append(row)
+            yield {"rows": rows}
 
 
 def drawn(bench: Bench, modelled: ModelledFrame, capture: Capture, options: RasterOptions | None) -> Row:
@@ -401,6 +455,7 @@ def trials(make: Callable[[Bench], Sequence[Trial]]) -> Callable[[Bench], Iterat
 SECTIONS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "captures": measure_captures,
     "large": measure_large,
+    "strides": measure_strides,
     "rade": trials(rade_trials),
     "variants": trials(variant_trials),
     "gaussians": trials(
@@ -419,6 +474,7 @@ def main() -> int:
     parser.add_argument(
         "--only", nargs="+", default=(), choices=SECTIONS, metavar="SECTION", help="these sections only"
     )
+    parser.add_argument("--small", action="store_true", help="few Gaussians, for a CPU")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     with tempfile.TemporaryDirectory() as folder:
@@ -429,7 +485,7 @@ def main() -> int:
             captures = {name: Capture.read(arguments.data / "captures" / name) for name in CAPTURES}
         bench = Bench(
             captures,
-            QUICK if arguments.quick else Effort(),
+            QUICK if arguments.quick else SMALL if arguments.small else Effort(),
             lambda fitting, tracking: of_options(fitting, arguments.device, tracking),
             device,
             arguments.keep,

@@ -140,7 +140,8 @@ class FitAndTrack:
         motion = motion_in_pixels(track.joints, following.joints, cameras)
         surprise = motion_in_pixels(2.0 * track.joints - track.previous_joints, following.joints, cameras)
         reach = STRUCTURE_REACH * max(self._tracking.joints.levels)
-        if not surprise.max() <= reach:
+        found = report["start"] == "silhouettes" and not report["lost"]
+        if not surprise.max() <= reach and not found:
             findings.append(
                 Finding(
                     "warning",

@@ -186,8 +186,8 @@ def test_a_pose_stays_what_it_was_when_the_next_is_found(device):
     target = resolve_device(device)
     raster = BRIEF.refinement.raster
     tracker = JointTracker(track.cloud, track.anchors, track.graph, track.joints, BRIEF.joints, raster, target)
-    start = JointPose(track.turns, track.joints)
-    pose = tracker.find(views, start, 1, 0)
+    start = {"there": JointPose(track.turns, track.joints)}
+    pose, _ = tracker.find(views, start, 1, 0)
     carried = tracker.carried(track.cloud)
     kept = pose.positions.copy(), carried.positions.copy()
     tracker.find(ball_views(CAMERAS[:2], (-0.05, 0.0, 0.0)), start, 1, 0)
@@ -213,7 +213,8 @@ class TestCoarseLevels:
             monkeypatch.setattr(joint_tracking, "GAUSSIANS_PER_PIXEL", per_pixel)
             raster, target = OPTIONS.refinement.raster, resolve_device(device)
             tracker = JointTracker(key.cloud, key.anchors, key.graph, key.joints, options, raster, target)
-            pose = tracker.find(ball_views(CAMERAS, center, turn), JointPose(key.turns, key.joints), 1, 0)
+            start = {"there": JointPose(key.turns, key.joints)}
+            pose, _ = tracker.find(ball_views(CAMERAS, center, turn), start, 1, 0)
             errors.append(pose.positions - (turn.apply(key.key_joints) + center))
         few, every = (np.sqrt((error**2).sum(axis=1).mean()) for error in errors)
         assert drawn[2:] == [400, 400]
@@ -256,6 +257,7 @@ class TestRefusals:
         ("changes", "match"),
         [
             ({"joint_count": 0}, "joint_count must be"),
+            ({"reach": np.nan}, "reach must be"),
             ({"largest_drop": -1.0}, "largest_drop must be"),
             ({"largest_gap": np.nan}, "largest_gap must be"),
             ({"largest_tear": -0.1}, "largest_tear must be"),

@@ -1,0 +1,109 @@
+"""Motion that photographs reduced as far as tracking goes do not find: silhouettes tell where the body has gone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import trimesh
+import warp as wp
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from beam_warp.capture.views import CapturedView
+from beam_warp.device.arrays import upload
+from beam_warp.errors import InvalidArrayError
+from beam_warp.reconstruction.hull import visual_hull
+from beam_warp.reconstruction.joint_tracking import JointPose
+from beam_warp.reconstruction.joints.graph import JointGraph
+from beam_warp.reconstruction.joints.registration import register
+from beam_warp.reconstruction.joints.selection import FAINTEST, select_joints
+from beam_warp.reconstruction.joints.skinning import Anchors, Skin
+from beam_warp.world.gaussians import GaussianCloud
+
+MOST_NODES = 400
+"""Gaussians that are moved onto the hull; joints go with them. Of a person, a limb is about two of their spacings wide:
+with half as many, limbs are torn."""
+
+POINTS_PER_NODE = 4
+"""Points of the hull for each of them."""
+
+HULL_RESOLUTION = 64
+"""Voxels along the longest side of the hull: half of a limb's width."""
+
+ASTRAY = 0.01
+"""Part of the joints that may lie anywhere."""
+
+
+def pixels_outside(points: NDArray[np.floating], views: Sequence[CapturedView], size: int) -> float:
+    """Return how far points lie outside the silhouettes in the view where they are farthest, but for `ASTRAY` of them.
+
+    Args:
+        points: Points of the subject's surface [m], ``(N, 3)``.
+        views: Views; only those with a mask that shows something count.
+        size: Pixels along a side of the squares that count as one; covered, if one of its pixels is.
+
+    Returns:
+        A distance in such squares, exact to one of them; 0 if no view tells.
+    """
+    farthest = np.zeros(len(points))
+    for view in views:
+        if view.alpha is None or not (view.alpha >= 0.5).any():
+            continue
+        covered = ndimage.maximum_filter(view.alpha, size)[size // 2 :: size, size // 2 :: size] >= 0.5
+        away = ndimage.distance_transform_edt(~covered)
+        x, y, depth = view.camera.project(points).T
+        rows, columns = np.floor(y / size), np.floor(x / size)
+        seen = (depth > 0.0) & (rows >= 0) & (columns >= 0) & (rows < away.shape[0]) & (columns < away.shape[1])
+        found = away[rows[seen].astype(int), columns[seen].astype(int)]
+        farthest[seen] = np.maximum(farthest[seen], found)
+    return float(np.quantile(farthest, 1.0 - ASTRAY))
+
+
+def pose_on_hull(
+    cloud: GaussianCloud,
+    normals: NDArray[np.float32],
+    carried: Anchors,
+    joints: NDArray[np.float32],
+    start: JointPose,
+    views: Sequence[CapturedView],
+    smallest_cosine: float,
+    device: Any,
+) -> JointPose | None:
+    """Return the pose in which joints lie on the visual hull of views; None where masks have none.
+
+    Args:
+        cloud: Gaussians of the frame before.
+        normals: Which way the surface faces at them, ``(N, 3)``; 0 where unknown.
+        carried: Anchors of the Gaussians to the joints.
+        joints: Joints in the frame before [m], ``(M, 3)``.
+        start: Pose to begin with.
+        views: The photographs.
+        smallest_cosine: Least cosine between normals of neighbours.
+        device: Warp device.
+    """
+    usable = np.flatnonzero(normals.any(axis=1) & (cloud.opacities >= FAINTEST))
+    if not len(usable):
+        return None
+    try:
+        hull = visual_hull(views, resolution=HULL_RESOLUTION, device=str(device)).mesh
+    except InvalidArrayError:
+        return None
+    nodes = usable[select_joints(cloud.positions[usable], min(MOST_NODES, len(usable)))]
+    rest, facing = cloud.positions[nodes].astype(np.float64), normals[nodes].astype(np.float64)
+    graph = JointGraph.build(rest, normals=facing, smallest_cosine=smallest_cosine)
+    points, faces, *_ = trimesh.sample.sample_surface(hull, POINTS_PER_NODE * len(nodes), seed=0)
+    first = carried.joints[:, 0]
+    turns = Rotation.from_quat(start.rotations[first[nodes]])
+    expected = turns.as_matrix(), start.positions[first[nodes]] + turns.apply(rest - joints[first[nodes]])
+    rotations, places = register(graph, rest, facing, np.asarray(points), hull.face_normals[faces], expected)
+    outward = np.stack([np.bincount(first, normals[:, axis], len(joints)) for axis in range(3)], axis=1)
+    anchors = Anchors.fit(joints, rest, normals=outward, joint_normals=facing, smallest_cosine=smallest_cosine)
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(joints), 1))
+    skin = Skin(joints, still, anchors, rest, device=device)
+    turned, moved = wp.clone(skin.rest_orientations), wp.clone(skin.rest_positions)
+    quaternions = Rotation.from_matrix(rotations).as_quat().astype(np.float32)
+    skin.warp(upload(quaternions, wp.quat, device), upload(places.astype(np.float32), wp.vec3, device), moved, turned)
+    return JointPose(turned.numpy().copy(), moved.numpy().copy())
