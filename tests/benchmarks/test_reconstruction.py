@@ -132,7 +132,15 @@ class TestSections:
         assert walker["first_seconds"]["count"] == TINY.repeats
         assert walker["same_bits"]
         assert [row["steps"] for row in result["large"]["frames"]] == ["default", "default", "draft", "draft"]
-        for function in (tables.captures, tables.results, tables.drawn, tables.large, tables.rade, tables.variants):
+        for function in (
+            tables.captures,
+            tables.results,
+            tables.drawn,
+            tables.large,
+            tables.rade,
+            tables.variants,
+            tables.strides,
+        ):
             head, *rows = function(result)
             assert len(rows) >= 2
             assert all(len(row) == len(head) for row in rows)

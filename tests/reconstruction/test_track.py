@@ -14,9 +14,10 @@ from support.threads import require_same_on_any_threads
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.reconstruction import joint_tracking
+from beam_warp.reconstruction import far_motion, joint_tracking
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker, hanging_together
+from beam_warp.reconstruction.joints import registration
 from beam_warp.reconstruction.targets import TargetSet
 from beam_warp.reconstruction.track import (
     GAUSSIANS_PER_JOINT,
@@ -287,6 +288,11 @@ def test_the_tracking_page_states_the_defaults():
         f"one joint for every {GAUSSIANS_PER_JOINT} Gaussians, but at least {fewest} and at most {most:,}",
         f"whose normals have a cosine below {SMALLEST_COSINE} are not neighbours",
         "reduced {}, {}, {} and {} times, in {} steps".format(*joints.levels, sum(joints.iterations)),
+        f"more than {100 * far_motion.ASTRAY:g} % of the joints would start more than {options.reach:g} pixels",
+        f"{far_motion.MOST_NODES} Gaussians",
+        f"{far_motion.MOST_NODES * far_motion.POINTS_PER_NODE:,} points",
+        "In {} rounds σ shrinks from {:g} to {:g} distances".format(registration.ROUNDS, *registration.WIDTHS),
+        f"τ is {registration.GIVE:g} of them, ν = {registration.FACING:g}, c = {registration.STRAY:g}",
         f"λ = {joints.rigidity:g} divided by the square of the reduction",
         f"are fitted in {options.refinement.normal_iterations} steps",
         f"more than {options.largest_drop:g} dB below that of the key frame, which counts as at most {NOISE_PSNR:g} dB",
