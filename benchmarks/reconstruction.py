@@ -10,7 +10,7 @@ Scored only, each row the walker's first frame: ``rade`` has others' choices, ma
 last of these with as many steps as they state; ``variants`` makes 3DGS's way of drawing ours one by one; ``gaussians``
 and ``cameras`` vary the number of either.
 
-``strides`` leaves frames of the walker out: one of two, three of four, all but the first and last. What each tracks is
+``strides`` plays the captures at every frame, every second and every fourth, as far as they go. What each tracks is
 scored with and without asking silhouettes where joints have gone, beside how far the true surface moves.
 
 ``--keep DIR`` writes the sequences of ``captures`` as ``DIR/NAME/gaussians.usda``, for benchmarks that need them.
@@ -24,6 +24,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import itertools
+import math
 import os
 import sys
 import tempfile
@@ -79,7 +80,7 @@ class Effort:
         large_tracked: Its tracked frames.
         samples: Paths per pixel of what is path traced here.
         surface_samples: Points on each surface of a Chamfer distance.
-        strides: Frames of ``strides`` from one that is tracked to the next.
+        strides: Frames from one that is tracked to the next, of ``strides``.
         fitting: Changes of our defaults.
         tracking: How frames are tracked.
     """
@@ -250,45 +251,46 @@ def measure_captures(bench: Bench) -> Iterator[Row]:
 
 def measure_strides(bench: Bench) -> Iterator[Row]:
     """Yield how frames follow of which more and more before them are left out, silhouettes asked and not."""
-    capture, device, tracking = bench.capture, bench.device, bench.effort.tracking
-    bench.warm(capture)
-    known = truth_frames(capture)
-    last = known[-1] if len(known) > 1 else capture.frames[-1]
-    cameras = [record.camera for record in capture.select(split="train", frames=known[:1])]
-    key = next(bench.follow(bench.make(bench.fitting, tracking), capture, known[:1]))
+    bench.warm(bench.capture)
     rows: list[Row] = []
-    for stride in bench.effort.strides:
-        frames = range(known[0], last + 1, stride)
-        meshes = [read_truth_mesh(capture, frame) for frame in frames]
-        motion = [motion_in_pixels(*(m.vertices for m in pair), cameras) for pair in itertools.pairwise(meshes)]
-        for asked in (False, True):
-            options = tracking if asked else replace(tracking, reach=np.inf)
-            contender = bench.make(bench.fitting, options)
-            modelled = [key, *follow(contender, capture, frames[1:], device, track=key.track)]
-            vertices = (mesh.vertices for mesh in meshes)
-            drift = tracking_drift(
-                (entry.cloud for entry in modelled), vertices, meshes[0].faces, cameras=cameras, device=device.alias
-            )
-            row: Row = {"stride": stride, "silhouettes": asked, "gaussians": len(key.cloud)}
-            row["motion"] = dict(zip(("median", "p95", "largest"), np.quantile(motion, (0.5, 0.95, 1.0)), strict=True))
-            row["frames"] = [
-                {
-                    "frame": entry.frame,
-                    "seconds": entry.seconds,
-                    "training_psnr": entry.report["psnr"],
-                    "start": entry.report.get("start", ""),
-                    "lost": entry.report.get("lost", ""),
-                    "drift": moved.as_dict(),
-                    **(
-                        {"psnr": bench.psnr(entry, capture, contender.options, entry.samples)}
-                        if entry.frame in known
-                        else {}
-                    ),
-                }
-                for entry, moved in zip(modelled, drift, strict=True)
-            ]
-            rows.append(row)
-            yield {"rows": rows}
+    for name, capture in bench.captures.items():
+        known = truth_frames(capture)
+        last = max(known[-1], known[0] + 1)
+        key = next(bench.follow(bench.make(bench.fitting, bench.effort.tracking), capture, known[:1]))
+        for stride in bench.effort.strides:
+            frames = range(known[0], last + 1, stride)
+            for reach in (math.inf, bench.effort.tracking.reach) if len(frames) > 1 else ():
+                tracking = replace(bench.effort.tracking, reach=reach)
+                row: Row = {"name": f"{name} {stride} {reach:g}", "capture": name, "stride": stride}
+                rows.append(row | {"silhouettes": reach < math.inf} | _tracked(bench, key, tracking, capture, frames))
+                yield {"gaussians": len(key.cloud), "rows": rows}
+
+
+def _tracked(bench: Bench, key: ModelledFrame, options: TrackOptions, capture: Capture, frames: Sequence[int]) -> Row:
+    """Return how far the surface moves from one of some frames to the next, and how these follow from the first."""
+    meshes = [read_truth_mesh(capture, frame) for frame in frames]
+    cameras = [record.camera for record in capture.select(split="train", frames=frames[:1])]
+    motion = [motion_in_pixels(*(mesh.vertices for mesh in pair), cameras) for pair in itertools.pairwise(meshes)]
+    contender = bench.make(bench.fitting, options)
+    modelled = [key, *follow(contender, capture, frames[1:], bench.device, track=key.track)]
+    clouds, vertices = (entry.cloud for entry in modelled), (mesh.vertices for mesh in meshes)
+    drift = tracking_drift(clouds, vertices, meshes[0].faces, cameras=cameras, device=bench.device.alias)
+    seen = {record.frame for record in capture.select(split="test")}
+    return {
+        "pixels": dict(zip(("median", "p95", "largest"), np.quantile(motion, (0.5, 0.95, 1.0)).tolist(), strict=True)),
+        "frames": [
+            {
+                "frame": entry.frame,
+                "seconds": entry.seconds,
+                "training_psnr": entry.report["psnr"],
+                "start": entry.report.get("start", ""),
+                "lost": entry.report.get("lost", ""),
+                "drift": moved.as_dict(),
+                "psnr": bench.psnr(entry, capture, contender.options, entry.samples) if entry.frame in seen else None,
+            }
+            for entry, moved in zip(modelled, drift, strict=True)
+        ],
+    }
 
 
 def drawn(bench: Bench, modelled: ModelledFrame, capture: Capture, options: RasterOptions | None) -> Row:

@@ -152,19 +152,20 @@ def strides(result: Row) -> Rows:
         "p95",
         "seconds",
     )
-    found: list[list[Any]] = [["one frame of", "silhouettes asked", *heads]]
+    found: list[list[Any]] = [["", "one frame of", "silhouettes", *heads]]
     for row in result["strides"]["rows"]:
         tracked, last = row["frames"][1:], row["frames"][-1]
         drift = last["drift"]["vertices"]
         found.append(
             [
+                row["capture"],
                 f"{row['stride']}",
-                "yes" if row["silhouettes"] else "no",
-                *(f"{row['motion'][key]:.0f} px" for key in ("p95", "largest")),
+                "asked" if row["silhouettes"] else "",
+                *(f"{row['pixels'][key]:.0f} px" for key in ("p95", "largest")),
                 ", ".join(dict.fromkeys(frame["start"] for frame in tracked)),
                 f"{sum(bool(frame['lost']) for frame in tracked)} of {len(tracked)}",
                 f"{last['training_psnr']:.1f}",
-                f"{last['psnr']:.1f}",
+                cell(last["psnr"], ".1f"),
                 *(f"{drift[key]:.1f} mm" for key in ("mean_mm", "p95_mm")),
                 f"{statistics.median(frame['seconds'] for frame in tracked):.0f}",
             ]
