@@ -160,7 +160,7 @@ def strides(result: Row) -> Rows:
             [
                 row["capture"],
                 f"{row['stride']}",
-                "asked" if row["silhouettes"] else "",
+                row["silhouettes"],
                 *(f"{row['pixels'][key]:.0f} px" for key in ("p95", "largest")),
                 ", ".join(dict.fromkeys(frame["start"] for frame in tracked)),
                 f"{sum(bool(frame['lost']) for frame in tracked)} of {len(tracked)}",

@@ -99,11 +99,21 @@ def pose_on_hull(
     turns = Rotation.from_quat(start.rotations[first[nodes]])
     expected = turns.as_matrix(), start.positions[first[nodes]] + turns.apply(rest - joints[first[nodes]])
     rotations, places = register(graph, rest, facing, np.asarray(points), hull.face_normals[faces], expected)
+    # Photographs find what is near better: a round body that spins has the same silhouettes.
+    away = places - expected[1]
+    squared = (away**2).sum(axis=1)
+    part = squared / (squared + graph.spacing**2)
+    places = expected[1] + part[:, None] * away
+    turns *= Rotation.from_rotvec(part[:, None] * (turns.inv() * Rotation.from_matrix(rotations)).as_rotvec())
     outward = np.stack([np.bincount(first, normals[:, axis], len(joints)) for axis in range(3)], axis=1)
     anchors = Anchors.fit(joints, rest, normals=outward, joint_normals=facing, smallest_cosine=smallest_cosine)
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(joints), 1))
     skin = Skin(joints, still, anchors, rest, device=device)
     turned, moved = wp.clone(skin.rest_orientations), wp.clone(skin.rest_positions)
-    quaternions = Rotation.from_matrix(rotations).as_quat().astype(np.float32)
-    skin.warp(upload(quaternions, wp.quat, device), upload(places.astype(np.float32), wp.vec3, device), moved, turned)
+    skin.warp(
+        upload(turns.as_quat().astype(np.float32), wp.quat, device),
+        upload(places.astype(np.float32), wp.vec3, device),
+        moved,
+        turned,
+    )
     return JointPose(turned.numpy().copy(), moved.numpy().copy())

@@ -72,7 +72,7 @@ class TrackOptions:
 
     joint_count: int | None = None
     joints: JointOptions = field(default_factory=JointOptions)
-    reach: float = 2.0
+    reach: float = 1.5
     refinement: FitOptions = field(
         default_factory=lambda: FitOptions(
             color_iterations=0,

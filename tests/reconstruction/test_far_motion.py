@@ -21,6 +21,7 @@ TURN = 75.0
 CAMERAS = rig(8, 48)
 
 OPTIONS = TrackOptions(
+    joint_count=250,
     joints=JointOptions(levels=(4, 2, 1), iterations=(16, 16, 24)),
     refinement=replace(TrackOptions().refinement, normal_iterations=20, samples=1),
 )
