@@ -44,10 +44,9 @@ def capsule_points(axis, radius, spacing):
     lean = np.where(along < 0.0, along, np.maximum(along - length, 0.0)) / radius
     around = np.sqrt(1.0 - lean**2)
     normals = np.stack([around * np.cos(angle), around * np.sin(angle), lean], axis=1)
+    points = np.stack([radius * normals[:, 0], radius * normals[:, 1], along], axis=1)
     turn, _ = Rotation.align_vectors([(axis[1] - axis[0]) / length], [[0.0, 0.0, 1.0]])
-    return turn.apply(np.stack([radius * normals[:, 0], radius * normals[:, 1], along], axis=1)) + axis[0], turn.apply(
-        normals
-    )
+    return axis[0] + turn.apply(points), turn.apply(normals)
 
 
 def surface(spacing, degrees=0.0):
@@ -59,16 +58,17 @@ def surface(spacing, degrees=0.0):
     return np.vstack([body[out], arm[shown]]), np.vstack([body_normals[out], arm_normals[shown]]), is_arm
 
 
-def limb_cloud(spacing):
-    """Discs on the figure at rest, painted, and which are the arm's."""
-    points, normals, is_arm = surface(spacing)
+def limb_cloud(spacing, degrees):
+    """Discs on the figure with its arm turned, painted, and which are the arm's."""
+    points, normals, is_arm = surface(spacing, degrees)
+    own = np.where(is_arm[:, None], arm_at(points, -degrees), points)
     count = len(points)
     return GaussianCloud(
         positions=points,
         orientations=quaternions_from_normals(normals),
         scales=np.tile([0.7 * spacing, 0.7 * spacing, 0.15 * spacing], (count, 1)),
         opacities=np.full(count, 0.8),
-        radiance=((paint(points) - 0.5) / SH_C0)[:, None, :],
+        radiance=((paint(own) - 0.5) / SH_C0)[:, None, :],
         radiance_color_space=LINEAR_REC709,
         ids=np.arange(count),
     ), is_arm
@@ -88,7 +88,7 @@ def _view(camera, degrees, name):
         away = np.minimum(distance(points, *BODY), distance(points, arm, ARM[1]))
         points = points + away[:, None] * directions
     on_arm = distance(points, arm, ARM[1]) < distance(points, *BODY)
-    own = np.where(on_arm[:, None], ARM[0][0] + turn_of(-degrees).apply(points - ARM[0][0]), points)
+    own = np.where(on_arm[:, None], arm_at(points, -degrees), points)
     hit = np.abs(away) < 1e-3
     colors = np.where(hit[:, None], paint(np.where(hit[:, None], own, 0.0)), 0.0)
     color, alpha = (block_means(image.reshape(*rays.shape[:2], -1), SAMPLES) for image in (colors, hit.astype(float)))
