@@ -10,8 +10,8 @@ Scored only, each row the walker's first frame: ``rade`` has others' choices, ma
 last of these with as many steps as they state; ``variants`` makes 3DGS's way of drawing ours one by one; ``gaussians``
 and ``cameras`` vary the number of either.
 
-``strides`` plays the captures at every frame, every second and every fourth, as far as they go. What each tracks is
-scored beside how far the true surface moves; where it began with what silhouettes show, also without them.
+``strides`` plays the walker at every fourth frame, every second, and every one. What each tracks is scored, beside how
+far the true surface moves; where it began with what silhouettes show, also without them.
 
 ``--keep DIR`` writes the sequences of ``captures`` as ``DIR/NAME/gaussians.usda``, for benchmarks that need them.
 ``--small`` is what a CPU can do: few Gaussians, a sample a pixel, a draft for the key frame. ``--quick`` takes the
@@ -96,7 +96,7 @@ class Effort:
     large_tracked: int = 8
     samples: int = 32
     surface_samples: int = SAMPLE_COUNT
-    strides: tuple[int, ...] = (1, 2, 4)
+    strides: tuple[int, ...] = (4, 2, 1)
     fitting: Row = field(default_factory=dict)
     tracking: TrackOptions = field(default_factory=TrackOptions)
 
@@ -250,27 +250,26 @@ def measure_captures(bench: Bench) -> Iterator[Row]:
 
 
 def measure_strides(bench: Bench) -> Iterator[Row]:
-    """Yield how frames follow of which more and more before them are left out, silhouettes asked and not."""
+    """Yield how frames follow of which more or fewer before them are left out, with and without silhouettes."""
     bench.warm(bench.capture)
+    capture, effort = bench.capture, bench.effort
+    known = truth_frames(capture)
+    last = max(known[-1], known[0] + 1)
+    key = next(bench.follow(bench.make(bench.fitting, effort.tracking), capture, known[:1]))
     rows: list[Row] = []
-    for name, capture in bench.captures.items():
-        known = truth_frames(capture)
-        last = max(known[-1], known[0] + 1)
-        key = next(bench.follow(bench.make(bench.fitting, bench.effort.tracking), capture, known[:1]))
-        for stride in bench.effort.strides:
-            frames = range(known[0], last + 1, stride)
-            for word in ("with", "without") if len(frames) > 1 else ():
-                reach = bench.effort.tracking.reach if word == "with" else math.inf
-                tracking = replace(bench.effort.tracking, reach=reach)
-                row: Row = {"name": f"{name} {stride} {word}", "capture": name, "stride": stride, "silhouettes": word}
-                rows.append(row | _tracked(bench, key, tracking, capture, frames))
-                yield {"gaussians": len(key.cloud), "rows": rows}
-                if all(frame["start"] != "silhouettes" for frame in rows[-1]["frames"]):
-                    break  # the same without them
+    for stride in effort.strides:
+        for word, reach in (("with", effort.tracking.reach), ("without", math.inf)):
+            row: Row = {"name": f"{stride} {word}", "stride": stride, "silhouettes": word}
+            tracking = replace(effort.tracking, reach=reach)
+            rows.append(row | _tracked(bench, key, tracking, range(known[0], last + 1, stride)))
+            yield {"gaussians": len(key.cloud), "rows": rows}
+            if all(frame["start"] != "silhouettes" for frame in rows[-1]["frames"]):
+                break  # the same without them
 
 
-def _tracked(bench: Bench, key: ModelledFrame, options: TrackOptions, capture: Capture, frames: Sequence[int]) -> Row:
+def _tracked(bench: Bench, key: ModelledFrame, options: TrackOptions, frames: Sequence[int]) -> Row:
     """Return how far the surface moves from one of some frames to the next, and how these follow from the first."""
+    capture = bench.capture
     meshes = [read_truth_mesh(capture, frame) for frame in frames]
     cameras = [record.camera for record in capture.select(split="train", frames=frames[:1])]
     motion = [motion_in_pixels(*(mesh.vertices for mesh in pair), cameras) for pair in itertools.pairwise(meshes)]

@@ -152,13 +152,12 @@ def strides(result: Row) -> Rows:
         "p95",
         "seconds",
     )
-    found: list[list[Any]] = [["", "one frame of", "silhouettes", *heads]]
-    for row in result["strides"]["rows"]:
+    found: list[list[Any]] = [["one frame of", "silhouettes", *heads]]
+    for row in sorted(result["strides"]["rows"], key=lambda row: row["stride"]):
         tracked, last = row["frames"][1:], row["frames"][-1]
         drift = last["drift"]["vertices"]
         found.append(
             [
-                row["capture"],
                 f"{row['stride']}",
                 row["silhouettes"],
                 *(f"{row['pixels'][key]:.0f} px" for key in ("p95", "largest")),
