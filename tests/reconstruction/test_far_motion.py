@@ -82,7 +82,7 @@ def key_track():
 
 class TestTracking:
     def test_an_arm_that_swings_far_is_followed(self):
-        """Its end moves by 23 pixels and it is 5 wide: photographs reduced 4 times alone lose it, and that is said."""
+        """The end of an arm 5 pixels wide moves by 23: photographs reduced 4 times alone lose it, and that is said."""
         (track, is_arm), views = key_track(), limb_views(CAMERAS, 0.5 * TURN)
         found, report = advance_track(track, views, OPTIONS, device="cpu")
         goal = np.where(is_arm[:, None], arm_at(track.cloud.positions, TURN), track.cloud.positions)
