@@ -23,6 +23,8 @@ from beam_warp.reconstruction.joints.selection import FAINTEST, select_joints
 from beam_warp.reconstruction.joints.skinning import Anchors, Skin
 from beam_warp.world.gaussians import GaussianCloud
 
+FloatArray = NDArray[np.float64]
+
 MOST_NODES = 400
 """Gaussians that are moved onto the hull; joints go with them. Of a person, a limb is about two of their spacings wide:
 with half as many, limbs are torn."""
@@ -97,23 +99,35 @@ def pose_on_hull(
     points, faces, *_ = trimesh.sample.sample_surface(hull, POINTS_PER_NODE * len(nodes), seed=0)
     first = carried.joints[:, 0]
     turns = Rotation.from_quat(start.rotations[first[nodes]])
-    expected = turns.as_matrix(), start.positions[first[nodes]] + turns.apply(rest - joints[first[nodes]])
-    rotations, places = register(graph, rest, facing, np.asarray(points), hull.face_normals[faces], expected)
-    # Photographs find what is near better: a round body that spins has the same silhouettes.
-    away = places - expected[1]
-    squared = (away**2).sum(axis=1)
-    part = squared / (squared + graph.spacing**2)
-    places = expected[1] + part[:, None] * away
-    turns *= Rotation.from_rotvec(part[:, None] * (turns.inv() * Rotation.from_matrix(rotations)).as_rotvec())
+    places = start.positions[first[nodes]] + turns.apply(rest - joints[first[nodes]])
+    surface = np.asarray(points), hull.face_normals[faces]
+    matrices, found = register(graph, rest, facing, *surface, (turns.as_matrix(), places))
+    far = _only_far(turns, places, Rotation.from_matrix(matrices), found, graph.spacing)
     outward = np.stack([np.bincount(first, normals[:, axis], len(joints)) for axis in range(3)], axis=1)
     anchors = Anchors.fit(joints, rest, normals=outward, joint_normals=facing, smallest_cosine=smallest_cosine)
-    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(joints), 1))
-    skin = Skin(joints, still, anchors, rest, device=device)
-    turned, moved = wp.clone(skin.rest_orientations), wp.clone(skin.rest_positions)
-    skin.warp(
-        upload(turns.as_quat().astype(np.float32), wp.quat, device),
-        upload(places.astype(np.float32), wp.vec3, device),
-        moved,
-        turned,
+    return _carry(joints, anchors, rest, *far, device)
+
+
+def _only_far(
+    turns: Rotation, places: FloatArray, found_turns: Rotation, found: FloatArray, near: float
+) -> tuple[Rotation, FloatArray]:
+    """Return found poses, and the expected ones where they are near: photographs find small motions better.
+
+    Silhouettes do not show whether a round body spins.
+    """
+    squared = ((found - places) ** 2).sum(axis=1, keepdims=True)
+    part = squared / (squared + near**2)
+    return turns * Rotation.from_rotvec(part * (turns.inv() * found_turns).as_rotvec()), places + part * (
+        found - places
     )
+
+
+def _carry(
+    joints: NDArray[np.float32], anchors: Anchors, rest: FloatArray, turns: Rotation, places: FloatArray, device: Any
+) -> JointPose:
+    """Return where nodes carry the joints."""
+    skin = Skin(joints, np.tile([0.0, 0.0, 0.0, 1.0], (len(joints), 1)), anchors, rest, device=device)
+    turned, moved = wp.clone(skin.rest_orientations), wp.clone(skin.rest_positions)
+    rotations = upload(turns.as_quat().astype(np.float32), wp.quat, device)
+    skin.warp(rotations, upload(places.astype(np.float32), wp.vec3, device), moved, turned)
     return JointPose(turned.numpy().copy(), moved.numpy().copy())
