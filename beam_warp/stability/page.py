@@ -87,7 +87,7 @@ if the run ends in anything but a reconstruction or a refusal where that is allo
   `few-cameras` below 8 of them; `camera-exposure` from {inspected:g} stops on, with 10 cameras or more.
 - The points of the surface that views share, in every frame: `camera-exposure` from {stops:g} stops on, which is undone
   before the frame is fitted or tracked; `few-cameras` where fewer than two views see most of the surface.
-- Tracking: `fast-motion` where a joint is farther from where its last step led than the coarsest level or silhouettes find;
+- Tracking: `fast-motion` where a joint is farther from where its last step led than the coarsest level finds;
   `new-surface` where a connected part of the subject is not covered, and `tracking-lost` where PSNR fell far or joints
   are torn apart, upon which the frame becomes a key frame.
 
