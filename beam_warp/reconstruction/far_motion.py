@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.registration import register
 from beam_warp.reconstruction.joints.selection import FAINTEST, select_joints
 from beam_warp.reconstruction.joints.skinning import Anchors, Skin
+from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
 FloatArray = NDArray[np.float64]
@@ -39,28 +41,53 @@ ASTRAY = 0.01
 """Part of the joints that may lie anywhere."""
 
 
-def pixels_outside(points: NDArray[np.floating], views: Sequence[CapturedView], size: int) -> float:
-    """Return how far points lie outside the silhouettes in the view where they are farthest, but for `ASTRAY` of them.
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """Distances to the subject in a view.
+
+    Attributes:
+        camera: Of the view.
+        away: How far squares of pixels are from the nearest one that shows something of the subject, in their sides.
+        size: Pixels along a side of a square.
+    """
+
+    camera: Camera
+    away: FloatArray
+    size: int
+
+    @classmethod
+    def of(cls, view: CapturedView, size: int) -> Silhouette | None:
+        """Measure a view; None where it has no mask, or one that shows nothing."""
+        if view.alpha is None or not (view.alpha >= 0.5).any():
+            return None
+        size = min(size, *view.alpha.shape)
+        rows, columns = (count // size for count in view.alpha.shape)
+        squares = view.alpha[: rows * size, : columns * size].reshape(rows, size, columns, size)
+        return cls(view.camera, ndimage.distance_transform_edt(squares.max(axis=(1, 3)) < 0.5), size)
+
+    def outside(self, points: NDArray[np.floating]) -> FloatArray:
+        """Return how far points are outside, ``(N,)``; 0 for those that the image does not show."""
+        x, y, depth = self.camera.project(points).T
+        rows, columns = np.floor(y / self.size), np.floor(x / self.size)
+        seen = (depth > 0.0) & (rows >= 0) & (columns >= 0) & (rows < len(self.away)) & (columns < self.away.shape[1])
+        found = np.zeros(len(points))
+        found[seen] = self.away[rows[seen].astype(int), columns[seen].astype(int)]
+        return found
+
+
+def squares_outside(points: NDArray[np.floating], silhouettes: Sequence[Silhouette]) -> float:
+    """Return how far points are outside the silhouettes where each is farthest, but for `ASTRAY` of them.
 
     Args:
         points: Points of the subject's surface [m], ``(N, 3)``.
-        views: Views; only those with a mask that shows something count.
-        size: Pixels along a side of the squares that count as one; covered, if one of its pixels is.
+        silhouettes: Of views.
 
     Returns:
-        A distance in such squares, exact to one of them; 0 if no view tells.
+        A distance in squares, exact to one of them; 0 without silhouettes.
     """
     farthest = np.zeros(len(points))
-    for view in views:
-        if view.alpha is None or not (view.alpha >= 0.5).any():
-            continue
-        covered = ndimage.maximum_filter(view.alpha, size)[size // 2 :: size, size // 2 :: size] >= 0.5
-        away = ndimage.distance_transform_edt(~covered)
-        x, y, depth = view.camera.project(points).T
-        rows, columns = np.floor(y / size), np.floor(x / size)
-        seen = (depth > 0.0) & (rows >= 0) & (columns >= 0) & (rows < away.shape[0]) & (columns < away.shape[1])
-        found = away[rows[seen].astype(int), columns[seen].astype(int)]
-        farthest[seen] = np.maximum(farthest[seen], found)
+    for silhouette in silhouettes:
+        farthest = np.maximum(farthest, silhouette.outside(points))
     return float(np.quantile(farthest, 1.0 - ASTRAY))
 
 

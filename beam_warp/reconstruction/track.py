@@ -22,7 +22,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.reconstruction.far_motion import pixels_outside, pose_on_hull
+from beam_warp.reconstruction.far_motion import Silhouette, pose_on_hull, squares_outside
 from beam_warp.reconstruction.fit import NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
@@ -284,7 +284,8 @@ def _starts(track: Track, views: Sequence[CapturedView], options: TrackOptions, 
     starts = {"continued": JointPose(track.turns, 2.0 * track.joints - track.previous_joints)}
     if (track.joints != track.previous_joints).any():
         starts["ended"] = JointPose(_unturned(len(track.joints)), track.joints)
-    away = {name: pixels_outside(start.positions, views, options.joints.levels[0]) for name, start in starts.items()}
+    silhouettes = [found for view in views if (found := Silhouette.of(view, options.joints.levels[0])) is not None]
+    away = {name: squares_outside(start.positions, silhouettes) for name, start in starts.items()}
     nearest = min(away, key=away.__getitem__)
     if away[nearest] > options.reach:
         subject = track.cloud, track.normals(), track.anchors, track.joints

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from support.moving_ball import RADIUS, ball_views, rig
 from support.two_limbs import ARM, BODY, arm_at, distance, limb_cloud, limb_views, surface, turn_of
 
-from beam_warp.reconstruction.far_motion import pixels_outside
+from beam_warp.reconstruction.far_motion import Silhouette, squares_outside
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
 from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.joints.graph import JointGraph
@@ -61,14 +61,22 @@ class TestSilhouettes:
     def test_points_beside_a_ball_are_as_far_outside_as_they_were_moved(self, size):
         cameras = rig(6, 40)
         rim = RADIUS * np.stack([np.zeros(200), *(f(np.linspace(0, 2 * np.pi, 200)) for f in (np.cos, np.sin))], axis=1)
-        views, pixel = ball_views(cameras), 2.5 / cameras[0].focal_x
-        assert pixels_outside(rim, views, size) <= 1.0
-        found = pixels_outside(rim + np.array([0.0, 0.3, 0.0]), views, size)
+        pixel = 2.5 / cameras[0].focal_x
+        silhouettes = [Silhouette.of(view, size) for view in ball_views(cameras)]
+        assert squares_outside(rim, silhouettes) <= 1.0
+        found = squares_outside(rim + np.array([0.0, 0.3, 0.0]), silhouettes)
         assert found * size == pytest.approx(0.3 / pixel, abs=1.5 * size)
 
-    def test_views_without_masks_tell_nothing(self):
-        views = [*ball_views(rig(2, 16), with_alpha=False), *ball_views(rig(2, 16), (9.0, 9.0, 9.0))]
-        assert pixels_outside(np.full((5, 3), 0.6), views, 2) == 0.0
+    def test_views_that_show_no_mask_tell_nothing(self):
+        views = [*ball_views(rig(1, 16), with_alpha=False), *ball_views(rig(1, 16), (9.0, 9.0, 9.0))]
+        assert [Silhouette.of(view, 2) for view in views] == [None, None]
+        assert squares_outside(np.zeros((5, 3)), []) == 0.0
+
+    def test_images_smaller_than_a_square(self):
+        (view,) = ball_views(rig(1, 3))
+        found = Silhouette.of(view, 8)
+        assert found.away.shape == (1, 1)
+        assert squares_outside(np.zeros((5, 3)), [found]) == 0.0
 
 
 @cache
