@@ -224,6 +224,7 @@ TRACKING = (
     Constant(
         "beam_warp.reconstruction.steps:MOST_UNPAIRED", JUDGED, "Part seen by one view that is reported.", NO_SCORE
     ),
+    Constant("beam_warp.reconstruction.steps:DOUBTFUL_TEAR", WALKER, "Part of torn joints that is reported.", NO_SCORE),
     Constant("beam_warp.reconstruction.steps:STRUCTURE_REACH", JUDGED, "Pixels that tracking reaches.", NO_SCORE),
     Constant("beam_warp.reconstruction.frames.report:DRIFT_WARNING", JUDGED, "Drift that is reported.", NO_SCORE),
 )

@@ -286,6 +286,7 @@ def _tracked(bench: Bench, key: ModelledFrame, options: TrackOptions, frames: Se
                 "seconds": entry.seconds,
                 "training_psnr": entry.report["psnr"],
                 "start": entry.report.get("start", ""),
+                "torn": entry.report.get("torn", 0.0),
                 "lost": entry.report.get("lost", ""),
                 "drift": moved.as_dict(),
                 "psnr": bench.psnr(entry, capture, contender.options, entry.samples) if entry.frame in seen else None,
