@@ -272,7 +272,8 @@ def _tracked(bench: Bench, key: ModelledFrame, options: TrackOptions, frames: Se
     capture = bench.capture
     meshes = [read_truth_mesh(capture, frame) for frame in frames]
     cameras = [record.camera for record in capture.select(split="train", frames=frames[:1])]
-    motion = [motion_in_pixels(*(mesh.vertices for mesh in pair), cameras) for pair in itertools.pairwise(meshes)]
+    pairs = itertools.pairwise(meshes)
+    motion = [motion_in_pixels(before.vertices, after.vertices, cameras) for before, after in pairs]
     contender = bench.make(bench.fitting, options)
     modelled = [key, *follow(contender, capture, frames[1:], bench.device, track=key.track)]
     clouds, vertices = (entry.cloud for entry in modelled), (mesh.vertices for mesh in meshes)

@@ -63,7 +63,8 @@ class Silhouette:
         size = min(size, *view.alpha.shape)
         rows, columns = (count // size for count in view.alpha.shape)
         squares = view.alpha[: rows * size, : columns * size].reshape(rows, size, columns, size)
-        return cls(view.camera, ndimage.distance_transform_edt(squares.max(axis=(1, 3)) < 0.5), size)
+        away: Any = ndimage.distance_transform_edt(squares.max(axis=(1, 3)) < 0.5)  # its types allow for no distances
+        return cls(view.camera, away, size)
 
     def outside(self, points: NDArray[np.floating]) -> FloatArray:
         """Return how far points are outside, ``(N,)``; 0 for those that the image does not show."""
