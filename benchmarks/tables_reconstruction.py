@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -141,17 +140,7 @@ def large(main: Row) -> Rows:
 @table("tracking_strides", STRIDES)
 def strides(result: Row) -> Rows:
     """Return how frames follow that are farther and farther apart, with and without silhouettes."""
-    heads = (
-        "p95",
-        "largest",
-        "begun with",
-        "lost",
-        "training views [dB]",
-        "novel views [dB]",
-        "drift",
-        "p95",
-        "seconds",
-    )
+    heads = ("p95", "largest", "begun with", "lost", "training views [dB]", "novel views [dB]", "drift", "p95")
     found: list[list[Any]] = [["one frame of", "silhouettes", *heads]]
     for row in sorted(result["strides"]["rows"], key=lambda row: row["stride"]):
         tracked, last = row["frames"][1:], row["frames"][-1]
@@ -166,7 +155,6 @@ def strides(result: Row) -> Rows:
                 f"{last['training_psnr']:.1f}",
                 cell(last["psnr"], ".1f"),
                 *(f"{drift[key]:.1f} mm" for key in ("mean_mm", "p95_mm")),
-                f"{statistics.median(frame['seconds'] for frame in tracked):.0f}",
             ]
         )
     return found
