@@ -24,6 +24,7 @@ EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 MASKED = "these captures have masks; it counts only for photographs without"
 EXACT_EXPOSURES = "exposures of these captures are equal, and colours stay as they are"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
+FAR_MOTION = "only motion beyond the reach of reduced images uses it, which these frames do not have"
 NO_SCORE = "it decides what is reported, and moves no score"
 BINARY = "a list of powers of two"
 
@@ -73,6 +74,8 @@ FIT = "beam_warp.reconstruction.fit:"
 INITIAL = "beam_warp.reconstruction.initial:"
 TRACK = "beam_warp.reconstruction.track:"
 JOINTS = "beam_warp.reconstruction.joint_tracking:"
+FAR = "beam_warp.reconstruction.far_motion:"
+REGISTRATION = "beam_warp.reconstruction.joints.registration:"
 EVIDENCE = "beam_warp.materials.evidence:"
 ROUGHNESS = "beam_warp.materials.roughness:"
 RESIDUES = "beam_warp.kernels.materials.residues:"
@@ -205,6 +208,15 @@ TRACKING = (
     Constant("beam_warp.reconstruction.joints.skinning:Anchors.fit(neighbor_count)", BOTH, "Joints of a Gaussian."),
     Constant("beam_warp.reconstruction.joints.selection:OVERSAMPLING", BOTH, "Candidates for a joint."),
     Constant("beam_warp.reconstruction.joints.selection:NEIGHBORS", JUDGED, "Neighbours of one that is not astray."),
+    Constant(TRACK + "TrackOptions.reach", WALKER, "Pixels from which on silhouettes are asked.", FAR_MOTION),
+    Constant(FAR + "MOST_NODES " + FAR + "POINTS_PER_NODE", WALKER, "Points of either surface.", FAR_MOTION),
+    Constant(FAR + "HULL_RESOLUTION", JUDGED, "Voxels of the hull that joints are moved to.", FAR_MOTION),
+    Constant(FAR + "ASTRAY", JUDGED, "Part of the joints that may be astray.", FAR_MOTION),
+    Constant(REGISTRATION + "WIDTHS", WALKER, "Width of shares, in distances of neighbours.", FAR_MOTION),
+    Constant(REGISTRATION + "GIVE", WALKER, "Deviation of an edge from rigid, likewise.", FAR_MOTION),
+    Constant(REGISTRATION + "FACING", WALKER, "Deviation of normals.", FAR_MOTION),
+    Constant(REGISTRATION + "STRAY", JUDGED, "Share of what nothing explains.", FAR_MOTION),
+    Constant(REGISTRATION + "ROUNDS " + REGISTRATION + "TURNS", WALKER, "Rounds of moving.", FAR_MOTION),
     Constant(TRACK + "TrackOptions.largest_drop", WALKER, "Loss of PSNR at which tracking is lost [dB].", NO_SCORE),
     Constant(TRACK + "TrackOptions.largest_gap", WALKER, "Uncovered part at which it is lost.", NO_SCORE),
     Constant(TRACK + "TrackOptions.largest_tear", WALKER, "Part of torn joints at which it is lost.", NO_SCORE),
@@ -212,6 +224,7 @@ TRACKING = (
     Constant(
         "beam_warp.reconstruction.steps:MOST_UNPAIRED", JUDGED, "Part seen by one view that is reported.", NO_SCORE
     ),
+    Constant("beam_warp.reconstruction.steps:DOUBTFUL_TEAR", WALKER, "Part of torn joints that is reported.", NO_SCORE),
     Constant("beam_warp.reconstruction.steps:STRUCTURE_REACH", JUDGED, "Pixels that tracking reaches.", NO_SCORE),
     Constant("beam_warp.reconstruction.frames.report:DRIFT_WARNING", JUDGED, "Drift that is reported.", NO_SCORE),
 )

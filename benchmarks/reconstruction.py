@@ -10,8 +10,12 @@ Scored only, each row the walker's first frame: ``rade`` has others' choices, ma
 last of these with as many steps as they state; ``variants`` makes 3DGS's way of drawing ours one by one; ``gaussians``
 and ``cameras`` vary the number of either.
 
+``strides`` plays the walker at every fourth frame, every second, and every one. What each tracks is scored, beside how
+far the true surface moves; where it began with what silhouettes show, also without them.
+
 ``--keep DIR`` writes the sequences of ``captures`` as ``DIR/NAME/gaussians.usda``, for benchmarks that need them.
-``--quick`` takes the demo's capture and few Gaussians: does all of it run? Images are read before the clock starts;
+``--small`` is what a CPU can do: few Gaussians, a sample a pixel, a draft for the key frame. ``--quick`` takes the
+demo's capture and few Gaussians: does all of it run? Images are read before the clock starts;
 scores and meshes are made after it stops. A section that fails says so in its place, and the program returns 1.
 """
 
@@ -19,6 +23,8 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import itertools
+import math
 import os
 import sys
 import tempfile
@@ -44,6 +50,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.joint_tracking import JointOptions
+from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, truth_frames
 from beam_warp.reconstruction.targets import MOST_SAMPLES
 from beam_warp.reconstruction.track import TrackOptions
@@ -73,6 +80,7 @@ class Effort:
         large_tracked: Its tracked frames.
         samples: Paths per pixel of what is path traced here.
         surface_samples: Points on each surface of a Chamfer distance.
+        strides: Frames from one that is tracked to the next, of ``strides``.
         fitting: Changes of our defaults.
         tracking: How frames are tracked.
     """
@@ -88,6 +96,7 @@ class Effort:
     large_tracked: int = 8
     samples: int = 32
     surface_samples: int = SAMPLE_COUNT
+    strides: tuple[int, ...] = (4, 2, 1)
     fitting: Row = field(default_factory=dict)
     tracking: TrackOptions = field(default_factory=TrackOptions)
 
@@ -96,6 +105,8 @@ BRIEF = TrackOptions(
     joints=JointOptions(levels=(2,), iterations=(4,)),
     refinement=replace(TrackOptions().refinement, normal_iterations=4),
 )
+SMALL = Effort(gaussians=20_000, fitting={"samples": 1, "color_iterations": 150, "normal_iterations": 300})
+
 QUICK = Effort(
     gaussians=2_000,
     counts=(1_000,),
@@ -108,6 +119,7 @@ QUICK = Effort(
     large_tracked=3,
     samples=2,
     surface_samples=2_000,
+    strides=(1,),
     fitting={"color_iterations": 8, "normal_iterations": 8, "refine_every": 4},
     tracking=BRIEF,
 )
@@ -235,6 +247,54 @@ def measure_captures(bench: Bench) -> Iterator[Row]:
             )
         rows.append(row)
         yield {"rows": rows}
+
+
+def measure_strides(bench: Bench) -> Iterator[Row]:
+    """Yield how frames follow of which more or fewer before them are left out, with and without silhouettes."""
+    bench.warm(bench.capture)
+    capture, effort = bench.capture, bench.effort
+    known = truth_frames(capture)
+    last = max(known[-1], known[0] + 1)
+    key = next(bench.follow(bench.make(bench.fitting, effort.tracking), capture, known[:1]))
+    rows: list[Row] = []
+    for stride in effort.strides:
+        for word, reach in (("with", effort.tracking.reach), ("without", math.inf)):
+            row: Row = {"name": f"{stride} {word}", "stride": stride, "silhouettes": word}
+            tracking = replace(effort.tracking, reach=reach)
+            rows.append(row | _tracked(bench, key, tracking, range(known[0], last + 1, stride)))
+            yield {"gaussians": len(key.cloud), "rows": rows}
+            if all(frame["start"] != "silhouettes" for frame in rows[-1]["frames"]):
+                break  # the same without them
+
+
+def _tracked(bench: Bench, key: ModelledFrame, options: TrackOptions, frames: Sequence[int]) -> Row:
+    """Return how far the surface moves from one of some frames to the next, and how these follow from the first."""
+    capture = bench.capture
+    meshes = [read_truth_mesh(capture, frame) for frame in frames]
+    cameras = [record.camera for record in capture.select(split="train", frames=frames[:1])]
+    pairs = itertools.pairwise(meshes)
+    motion = [motion_in_pixels(before.vertices, after.vertices, cameras) for before, after in pairs]
+    contender = bench.make(bench.fitting, options)
+    modelled = [key, *follow(contender, capture, frames[1:], bench.device, track=key.track)]
+    clouds, vertices = (entry.cloud for entry in modelled), (mesh.vertices for mesh in meshes)
+    drift = tracking_drift(clouds, vertices, meshes[0].faces, cameras=cameras, device=bench.device.alias)
+    seen = {record.frame for record in capture.select(split="test")}
+    return {
+        "pixels": dict(zip(("median", "p95", "largest"), np.quantile(motion, (0.5, 0.95, 1.0)).tolist(), strict=True)),
+        "frames": [
+            {
+                "frame": entry.frame,
+                "seconds": entry.seconds,
+                "training_psnr": entry.report["psnr"],
+                "start": entry.report.get("start", ""),
+                "torn": entry.report.get("torn", 0.0),
+                "lost": entry.report.get("lost", ""),
+                "drift": moved.as_dict(),
+                "psnr": bench.psnr(entry, capture, contender.options, entry.samples) if entry.frame in seen else None,
+            }
+            for entry, moved in zip(modelled, drift, strict=True)
+        ],
+    }
 
 
 def drawn(bench: Bench, modelled: ModelledFrame, capture: Capture, options: RasterOptions | None) -> Row:
@@ -401,6 +461,7 @@ def trials(make: Callable[[Bench], Sequence[Trial]]) -> Callable[[Bench], Iterat
 SECTIONS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "captures": measure_captures,
     "large": measure_large,
+    "strides": measure_strides,
     "rade": trials(rade_trials),
     "variants": trials(variant_trials),
     "gaussians": trials(
@@ -419,6 +480,7 @@ def main() -> int:
     parser.add_argument(
         "--only", nargs="+", default=(), choices=SECTIONS, metavar="SECTION", help="these sections only"
     )
+    parser.add_argument("--small", action="store_true", help="few Gaussians, for a CPU")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     with tempfile.TemporaryDirectory() as folder:
@@ -429,7 +491,7 @@ def main() -> int:
             captures = {name: Capture.read(arguments.data / "captures" / name) for name in CAPTURES}
         bench = Bench(
             captures,
-            QUICK if arguments.quick else Effort(),
+            QUICK if arguments.quick else SMALL if arguments.small else Effort(),
             lambda fitting, tracking: of_options(fitting, arguments.device, tracking),
             device,
             arguments.keep,

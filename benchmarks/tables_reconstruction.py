@@ -10,6 +10,7 @@ from tables import Row, Rows, cell, figure, number, table
 
 MAIN = "reconstruction_h200.json"
 CHOICES = "reconstruction_choices_h200.json"
+STRIDES = "reconstruction_strides_cpu.json"
 EXPOSURES = "exposures_cpu.json"
 
 MEASURES: tuple[tuple[str, Callable[[Row], float]], ...] = (
@@ -131,6 +132,29 @@ def large(main: Row) -> Rows:
                 f"{row['seconds']:.1f}",
                 cell(row.get("psnr"), ".1f"),
                 *(cell(value, ",.0f", factor=2.0**-20) for value in memory),
+            ]
+        )
+    return found
+
+
+@table("tracking_strides", STRIDES)
+def strides(result: Row) -> Rows:
+    """Return how frames follow that are farther and farther apart, with and without silhouettes."""
+    heads = ("p95", "largest", "begun with", "lost", "training views [dB]", "novel views [dB]", "drift", "p95")
+    found: list[list[Any]] = [["one frame of", "silhouettes", *heads]]
+    for row in sorted(result["strides"]["rows"], key=lambda row: row["stride"]):
+        tracked, last = row["frames"][1:], row["frames"][-1]
+        drift = last["drift"]["vertices"]
+        found.append(
+            [
+                f"{row['stride']}",
+                row["silhouettes"],
+                *(f"{row['pixels'][key]:.0f} px" for key in ("p95", "largest")),
+                ", ".join(dict.fromkeys(frame["start"] for frame in tracked)),
+                f"{sum(bool(frame['lost']) for frame in tracked)} of {len(tracked)}",
+                f"{last['training_psnr']:.1f}",
+                cell(last["psnr"], ".1f"),
+                *(f"{drift[key]:.1f} mm" for key in ("mean_mm", "p95_mm")),
             ]
         )
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -19,6 +19,7 @@ from beam_warp.device.morton import morton_order
 from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.reconstruction.fit import mean_psnr
 from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
@@ -127,21 +128,26 @@ class JointTracker:
         self._rotation_gradients = wp.zeros(count, dtype=wp.quat, device=device)
         self._position_gradients = wp.zeros(count, dtype=wp.vec3, device=device)
 
-    def find(self, views: Sequence[CapturedView], start: JointPose, samples: int, seed: int) -> JointPose:
+    def find(
+        self, views: Sequence[CapturedView], starts: Mapping[str, JointPose], samples: int, seed: int
+    ) -> tuple[JointPose, str]:
         """Move the joints until what they carry looks like the views.
 
         Args:
             views: The photographs.
-            start: Poses to begin with.
+            starts: Poses to choose from, by name, at least one: the first that looks most like the views, reduced as
+                far as any, is begun with.
             samples: Side of the square of samples of a pixel at full resolution.
             seed: Seed of the order of views.
+
+        Returns:
+            The poses, and the name of those that they began with.
         """
-        chosen = self._options
-        wp.copy(self._rotations, upload(start.rotations, wp.quat, self.device))
-        wp.copy(self._positions, upload(start.positions, wp.vec3, self.device))
+        chosen, begun = self._options, next(iter(starts))
+        self._pose(starts[begun])
         rng = np.random.default_rng(seed)
         rates = {"rotations": chosen.rotation_rate, "positions": chosen.position_rate * self._spacing}
-        for level, iterations in zip(chosen.levels, chosen.iterations, strict=True):
+        for index, (level, iterations) in enumerate(zip(chosen.levels, chosen.iterations, strict=True)):
             reduced = [view.reduced(min(level, view.camera.width, view.camera.height)) for view in views]
             carried = self._all if level == 1 else self._for_views(reduced)
             targets = TargetSet(reduced, carried.count, self._raster, samples if level == 1 else 1, self.device)
@@ -152,6 +158,10 @@ class JointTracker:
                 }
             )
             graphs = StepGraphs(self.device)
+            if index == 0 and len(starts) > 1:
+                likeness = {name: self._likeness(carried, targets, start) for name, start in starts.items()}
+                begun = max(likeness, key=likeness.__getitem__)
+                self._pose(starts[begun])
             carried.carry(self._rotations, self._positions)
             targets.make_room(carried.drawn)
             order = shuffled_views(rng, len(targets), iterations)
@@ -163,7 +173,19 @@ class JointTracker:
                 graphs.run(view, partial(self._step, carried, targets, view, adam, chosen.rigidity / level**2))
         rotations = self._rotations.numpy().astype(np.float64)
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
-        return JointPose(rotations.astype(np.float32), self._positions.numpy().copy())  # on the CPU it is the array
+        positions = self._positions.numpy().copy()  # on the CPU it is the array
+        return JointPose(rotations.astype(np.float32), positions), begun
+
+    def _pose(self, pose: JointPose) -> None:
+        """Put the joints somewhere."""
+        wp.copy(self._rotations, upload(pose.rotations, wp.quat, self.device))
+        wp.copy(self._positions, upload(pose.positions, wp.vec3, self.device))
+
+    def _likeness(self, carried: _Carried, targets: TargetSet, pose: JointPose) -> float:
+        """Return the PSNR of a pose [dB]."""
+        self._pose(pose)
+        carried.carry(self._rotations, self._positions)
+        return mean_psnr(targets.make_room(carried.drawn)[0])
 
     def carried(self, cloud: GaussianCloud) -> GaussianCloud:
         """Return a cloud where the joints carry it now."""

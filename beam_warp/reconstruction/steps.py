@@ -39,6 +39,10 @@ PLENTY = 24
 """Photographs without masks from which on all Gaussians and steps are spent: each is then looked at as often as those
 of the captures that the schedule was chosen on."""
 
+DOUBTFUL_TEAR = 0.005
+"""Part of the joints that are torn above which there is a finding: where a limb was missed, the fit of the Gaussians
+repaints it, and images tell little."""
+
 STRUCTURE_REACH = 5
 """Half a window of structural similarity [pixel]: a Gaussian farther from its place has no gradient towards it. At the
 coarsest level of tracking a pixel is as many as its reduction."""
@@ -140,7 +144,8 @@ class FitAndTrack:
         motion = motion_in_pixels(track.joints, following.joints, cameras)
         surprise = motion_in_pixels(2.0 * track.joints - track.previous_joints, following.joints, cameras)
         reach = STRUCTURE_REACH * max(self._tracking.joints.levels)
-        if not surprise.max() <= reach:
+        found = report["start"] == "silhouettes" and not report["lost"]
+        if not surprise.max() <= reach and not found:
             findings.append(
                 Finding(
                     "warning",
@@ -150,6 +155,10 @@ class FitAndTrack:
                     remedy="Record more frames a second, or plan shorter segments.",
                 )
             )
+        if not report["torn"] <= DOUBTFUL_TEAR and not report["lost"]:
+            what = f"{100.0 * report['torn']:.1f} % of the joints are torn from a neighbour: a limb may be elsewhere"
+            remedy = "Look at the frame, record more frames a second, or plan shorter segments."
+            findings.append(Finding("warning", "doubtful-motion", what, remedy=remedy))
         if report["lost"]:
             covered = report["gap"] <= track.baseline[1] + self._tracking.largest_gap
             code = "tracking-lost" if covered else "new-surface"

@@ -22,6 +22,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.sources import upload_gaussians
+from beam_warp.reconstruction.far_motion import Silhouette, pose_on_hull, squares_outside
 from beam_warp.reconstruction.fit import NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
@@ -56,6 +57,8 @@ class TrackOptions:
     Attributes:
         joint_count: Number of joints; None for one for every `GAUSSIANS_PER_JOINT` Gaussians.
         joints: How they are moved.
+        reach: Pixels of the most reduced images over which photographs pull joints. Where joints would begin farther
+            outside silhouettes, the visual hull says where they have gone; infinity: never.
         refinement: How the Gaussians that they carried are fitted; counts, refinements and the degree of the radiance,
             which is the key frame's, are not used.
         largest_drop: A frame whose PSNR is further below the key frame's is lost [dB].
@@ -69,6 +72,7 @@ class TrackOptions:
 
     joint_count: int | None = None
     joints: JointOptions = field(default_factory=JointOptions)
+    reach: float = 1.5
     refinement: FitOptions = field(
         default_factory=lambda: FitOptions(
             color_iterations=0,
@@ -114,7 +118,7 @@ class TrackOptions:
         """Check every option once."""
         if self.joint_count is not None:
             require_count("joint_count", self.joint_count)
-        for name in ("largest_drop", "largest_gap", "largest_tear"):
+        for name in ("reach", "largest_drop", "largest_gap", "largest_tear"):
             require_number(name, getattr(self, name), 0.0)
 
 
@@ -205,7 +209,7 @@ def begin_track(
     anchors = Anchors.fit(
         cloud.positions, joints, normals=normals, joint_normals=normals[rows], smallest_cosine=SMALLEST_COSINE
     )
-    still = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (len(joints), 1))
+    still = _unturned(len(joints))
     baseline = np.array([mean_psnr(psnr), targets.gaps(gaussians).max()])
     local = Rotation.from_quat(cloud.orientations).apply(normals, inverse=True).astype(np.float32)
     return Track(cloud, anchors, graph, local, joints, joints, joints, still, baseline)
@@ -230,7 +234,8 @@ def advance_track(
 
     Returns:
         The track of the frame, and a report, JSON-able: ``psnr`` of the training views' crops [dB], ``gap``,
-        ``torn``, ``gaussians``, ``samples``, ``seconds``, and ``lost``: why the track is lost, empty if it is not.
+        ``torn``, ``start`` (what joints began with: ``"continued"`` or ``"ended"`` motion, or ``"silhouettes"``),
+        ``gaussians``, ``samples``, ``seconds``, and ``lost``: why the track is lost, empty if it is not.
 
     Raises:
         InvalidArrayError: There is no view.
@@ -242,9 +247,8 @@ def advance_track(
     chosen = options.refinement
     samples = chosen_samples(chosen.samples, track.cloud, views)
     tracker = JointTracker(track.cloud, track.anchors, track.graph, track.joints, options.joints, chosen.raster, target)
-    # Where joints will be if they go on as they went: turned once more by their last turn.
-    expected = JointPose(track.turns, 2.0 * track.joints - track.previous_joints)
-    pose = tracker.find(views, expected, samples, chosen.seed)
+    starts = _starts(track, views, options, target)
+    pose, begun = tracker.find(views, starts, samples, chosen.seed)
     carried = tracker.carried(track.cloud)
     refinement = replace(
         chosen,
@@ -265,12 +269,34 @@ def advance_track(
         "view_psnr": float(np.nanmin(psnr, initial=NO_PSNR)),
         "gap": float(gaps.max()),
         "torn": torn,
+        "start": begun,
         "gaussians": len(cloud),
         "samples": samples,
         "lost": _why_lost(track, mean_psnr(psnr), gaps, torn, views, options),
         "seconds": time.perf_counter() - began,
     }
     return following, report
+
+
+def _starts(track: Track, views: Sequence[CapturedView], options: TrackOptions, device: Any) -> dict[str, JointPose]:
+    """Return poses that a frame may begin with: its motion went on, or ended, or is seen in silhouettes alone."""
+    # Where joints will be if they go on as they went: turned once more by their last turn.
+    starts = {"continued": JointPose(track.turns, 2.0 * track.joints - track.previous_joints)}
+    if (track.joints != track.previous_joints).any():
+        starts["ended"] = JointPose(_unturned(len(track.joints)), track.joints)
+    silhouettes = [found for view in views if (found := Silhouette.of(view, options.joints.levels[0])) is not None]
+    away = {name: squares_outside(start.positions, silhouettes) for name, start in starts.items()}
+    nearest = min(away, key=away.__getitem__)
+    if away[nearest] > options.reach:
+        subject = track.cloud, track.normals(), track.anchors, track.joints
+        found = pose_on_hull(*subject, starts[nearest], views, SMALLEST_COSINE, device)
+        starts |= {} if found is None else {"silhouettes": found}
+    return starts
+
+
+def _unturned(count: int) -> NDArray[np.float32]:
+    """Return rotations that do nothing, ``(count, 4)``."""
+    return np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1))
 
 
 def outward_normals(cloud: GaussianCloud, sides: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction import steps
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.initial import initial_gaussians
-from beam_warp.reconstruction.steps import MOST_UNPAIRED, STRUCTURE_REACH, FitAndTrack
+from beam_warp.reconstruction.steps import DOUBTFUL_TEAR, MOST_UNPAIRED, STRUCTURE_REACH, FitAndTrack
 
 STEPS = FitAndTrack(fitting=FitOptions(gaussian_count=200, color_iterations=1, normal_iterations=0), device="cpu")
 
@@ -29,12 +29,12 @@ def cloud(views):
 def advanced(monkeypatch, views, cloud):
     """A function that returns the report of a frame of which tracking makes what it is called with."""
 
-    def report_of(before=0.0, after=0.0, gap=0.0, lost=""):
+    def report_of(before=0.0, after=0.0, gap=0.0, lost="", start="continued", torn=0.0):
         joints, baseline = cloud.positions[:3], np.array([30.0, 0.01])
         track = SimpleNamespace(cloud=cloud, joints=joints, previous_joints=joints - before, baseline=baseline)
         track.normals = lambda: np.zeros((len(cloud), 3))
         following = SimpleNamespace(cloud=cloud, joints=joints + after)
-        report = {"psnr": 30.0, "gap": gap, "torn": 0.0, "lost": lost}
+        report = {"psnr": 30.0, "gap": gap, "torn": torn, "start": start, "lost": lost}
         monkeypatch.setattr(steps, "advance_track", lambda *args, **kwargs: (following, report))
         return STEPS.advance(track, views, no_progress)[1]
 
@@ -63,6 +63,19 @@ class TestTrackedFrames:
         pixels = advanced(after=step)["surprise"]
         for part, codes in ((0.9, []), (1.1, ["fast-motion"])):
             report = advanced(after=step * (reach * part / pixels))
+            assert [finding["code"] for finding in report["findings"]] == codes
+        for lost, codes in (("", []), ("so", ["fast-motion", "tracking-lost"])):
+            report = advanced(after=step * (2.0 * reach / pixels), start="silhouettes", lost=lost)
+            assert [finding["code"] for finding in report["findings"]] == codes
+
+    def test_a_few_torn_joints_are_said_unless_the_frame_is_lost(self, advanced):
+        for torn, lost, codes in (
+            (0.9 * DOUBTFUL_TEAR, "", []),
+            (1.1 * DOUBTFUL_TEAR, "", ["doubtful-motion"]),
+            (np.nan, "", ["doubtful-motion"]),
+            (0.5, "so", ["tracking-lost"]),
+        ):
+            report = advanced(torn=torn, lost=lost)
             assert [finding["code"] for finding in report["findings"]] == codes
 
     def test_a_loss_is_of_new_surface_or_of_track(self, advanced):

@@ -14,9 +14,10 @@ from support.threads import require_same_on_any_threads
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.reconstruction import joint_tracking
+from beam_warp.reconstruction import far_motion, joint_tracking
 from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker, hanging_together
+from beam_warp.reconstruction.joints import registration
 from beam_warp.reconstruction.targets import TargetSet
 from beam_warp.reconstruction.track import (
     GAUSSIANS_PER_JOINT,
@@ -114,8 +115,9 @@ class TestLost:
         assert report["lost"].startswith("PSNR fell from")
 
     def test_a_jump_beyond_reach(self, device):
-        """Nearly a diameter: some of the subject is not covered, and views are named in which."""
-        _, report = advance_track(key_track(device), ball_views(CAMERAS, (0.0, 0.0, 0.9)), FEWER, device=device)
+        """Nearly a diameter, silhouettes not asked: some is not covered, and views are named in which."""
+        options = replace(FEWER, reach=np.inf)
+        _, report = advance_track(key_track(device), ball_views(CAMERAS, (0.0, 0.0, 0.9)), options, device=device)
         assert "of the subject are not covered in view" in report["lost"]
 
     def test_nothing_is_lost_where_everything_is_allowed(self, device):
@@ -186,8 +188,8 @@ def test_a_pose_stays_what_it_was_when_the_next_is_found(device):
     target = resolve_device(device)
     raster = BRIEF.refinement.raster
     tracker = JointTracker(track.cloud, track.anchors, track.graph, track.joints, BRIEF.joints, raster, target)
-    start = JointPose(track.turns, track.joints)
-    pose = tracker.find(views, start, 1, 0)
+    start = {"there": JointPose(track.turns, track.joints)}
+    pose, _ = tracker.find(views, start, 1, 0)
     carried = tracker.carried(track.cloud)
     kept = pose.positions.copy(), carried.positions.copy()
     tracker.find(ball_views(CAMERAS[:2], (-0.05, 0.0, 0.0)), start, 1, 0)
@@ -213,7 +215,8 @@ class TestCoarseLevels:
             monkeypatch.setattr(joint_tracking, "GAUSSIANS_PER_PIXEL", per_pixel)
             raster, target = OPTIONS.refinement.raster, resolve_device(device)
             tracker = JointTracker(key.cloud, key.anchors, key.graph, key.joints, options, raster, target)
-            pose = tracker.find(ball_views(CAMERAS, center, turn), JointPose(key.turns, key.joints), 1, 0)
+            start = {"there": JointPose(key.turns, key.joints)}
+            pose, _ = tracker.find(ball_views(CAMERAS, center, turn), start, 1, 0)
             errors.append(pose.positions - (turn.apply(key.key_joints) + center))
         few, every = (np.sqrt((error**2).sum(axis=1).mean()) for error in errors)
         assert drawn[2:] == [400, 400]
@@ -256,6 +259,7 @@ class TestRefusals:
         ("changes", "match"),
         [
             ({"joint_count": 0}, "joint_count must be"),
+            ({"reach": np.nan}, "reach must be"),
             ({"largest_drop": -1.0}, "largest_drop must be"),
             ({"largest_gap": np.nan}, "largest_gap must be"),
             ({"largest_tear": -0.1}, "largest_tear must be"),
@@ -285,6 +289,11 @@ def test_the_tracking_page_states_the_defaults():
         f"one joint for every {GAUSSIANS_PER_JOINT} Gaussians, but at least {fewest} and at most {most:,}",
         f"whose normals have a cosine below {SMALLEST_COSINE} are not neighbours",
         "reduced {}, {}, {} and {} times, in {} steps".format(*joints.levels, sum(joints.iterations)),
+        f"more than {100 * far_motion.ASTRAY:g} % of the joints would start more than {options.reach:g} pixels",
+        f"{far_motion.MOST_NODES} Gaussians",
+        f"{far_motion.MOST_NODES * far_motion.POINTS_PER_NODE:,} points",
+        "In {} rounds σ shrinks from {:g} to {:g} distances".format(registration.ROUNDS, *registration.WIDTHS),
+        f"τ is {registration.GIVE:g} of them, ν = {registration.FACING:g}, c = {registration.STRAY:g}",
         f"λ = {joints.rigidity:g} divided by the square of the reduction",
         f"are fitted in {options.refinement.normal_iterations} steps",
         f"more than {options.largest_drop:g} dB below that of the key frame, which counts as at most {NOISE_PSNR:g} dB",
