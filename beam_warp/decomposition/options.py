@@ -69,6 +69,11 @@ class RunOptions:
         return "estimated" if self.roughness == ESTIMATE else "constant"
 
     @property
+    def shared_roughness(self) -> frozenset[str]:
+        """Names of the arrays of roughness that persistent Gaussians have in common."""
+        return frozenset({"roughness", "roughness_error"} if self.roughness == ESTIMATE else {"roughness"})
+
+    @property
     def gathering(self) -> MaterialOptions:
         """How light is gathered at points: `materials`, or on the image path, where estimates need it, its defaults."""
         return self.materials or MaterialOptions(seed=0 if self.images is None else self.images.seed)
