@@ -82,7 +82,12 @@ def workers(result: Row) -> Rows:
 @table("scale_start", "start_cpu.json")
 def start(result: Row) -> Rows:
     """Return how long a tiny take needs until its first step begins, and in all."""
-    parts = {"before": "until the first step [s]", "working": "steps [s]", "after": "after them [s]", "whole": "all [s]"}
+    parts = {
+        "before": "until the first step [s]",
+        "working": "steps [s]",
+        "after": "after them [s]",
+        "whole": "all [s]",
+    }
     return [
         ["workers", *parts.values()],
         *([row["workers"], *(cell(row[name], ".1f") for name in parts)] for row in result["start"]["rows"]),

@@ -1,6 +1,6 @@
 """What workers make of a take: ``beam run`` of 24 cameras of 1080p by one process, and by one on each GPU.
 
-    python benchmarks/workers.py [--quick] [--parts PART] [--frames N --segment-length N] [--workers WORD ...] --out JSON
+    python benchmarks/workers.py [--quick] [--parts PART] [--frames N --segment-length N] [--workers WORD ...] --out R
 
 ``start``: how long a tiny take needs until its first step begins, and in all, kernels compiled before. ``take``:
 The take shows a few moments of `beam_warp.demo.capture` over and over. A first run of few small views compiles kernels.

@@ -148,12 +148,7 @@ def _light_in_words(plan: JobPlan) -> str:
 
 
 def run_report(
-    plan: JobPlan,
-    made: Measurements,
-    *,
-    findings: list[dict[str, Any]],
-    persistent: bool,
-    seconds: float,
+    plan: JobPlan, made: Measurements, *, findings: list[dict[str, Any]], persistent: bool, seconds: float
 ) -> dict[str, Any]:
     """Return what was done, found and spent, JSON-able.
 

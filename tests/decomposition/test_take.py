@@ -63,7 +63,7 @@ def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
 @pytest.mark.slow
 @pytest.mark.parametrize(("length", "lost"), [(16, False), (0, False), (0, True)])
 def test_processes_write_the_same_clips(tmp_path, length, lost):
-    """Both assets of a take that is long enough to have clips, which are steps; whether it is persistent, these find."""
+    """Both assets of a take that is long enough to have clips, which are steps; these find whether it is persistent."""
     dim = {frame: 0.2 + 0.002 * frame for frame in range(64)}
     capture = Capture.read(write_capture(tmp_path / "capture", range(64), levels=dim | ({40: 0.95} if lost else {})))
     take(capture, tmp_path / "one", FakeSteps(), length)

@@ -1,4 +1,4 @@
-"""Takes of 20 frames that a storm of kills goes over: of steps that nap, or of real ones, small. Begun steps are noted."""
+"""Takes of 20 frames that a storm of kills goes over: of steps that nap, or of small real ones; begun steps are noted."""
 
 import os
 import time
