@@ -2,7 +2,8 @@
 
     python benchmarks/kills.py [--quick] [--steps toy|real] [--kills N] [--seed N] --out result.json
 
-- ``processes``: a driver with three processes; one of the four is killed, again and again.
+- ``processes``: a driver with three processes, and the server that these are forked from; one of the five is killed,
+  again and again.
 - ``cluster``: a driver and a Ray cluster of three pretended machines of one core. Killed are the raylet of a machine,
   which another one replaces; an actor's process; or the driver.
 
@@ -36,7 +37,7 @@ from parts import measure, say
 from workers import contents
 
 sys.path.insert(0, str(record.ROOT / "tests"))
-from support.storm_takes import TAKES, begun_file, draw_capture
+from support.storm_takes import TAKES, begun_file, draw_capture, processes_of
 
 from beam_warp.device.arrays import resolve_device
 from beam_warp.plan.standing import look
@@ -135,12 +136,13 @@ def processes(bench: Bench) -> Iterator[Row]:
     """Kill a driver, or twice as likely one of its three processes."""
 
     def kill(rng: random.Random, driver: int) -> tuple[str, int]:
-        children = [it for it in psutil.Process(driver).children() if "spawn_main" in str(it.cmdline())]
+        children = processes_of(driver)
         chosen = rng.choice([psutil.Process(driver), *children, *children])
+        workers = [child.pid for child in children if child.ppid() != driver]
         chosen.kill()
         if chosen.pid != driver:
-            return "worker", chosen.pid
-        return "driver" if children else "driver at the end", driver
+            return ("worker" if chosen.pid in workers else "server"), chosen.pid
+        return "driver" if workers else "driver at the end", driver
 
     yield from storm(bench, "3", kill)
 

@@ -1,7 +1,9 @@
 """Who does the steps of a plan: this process, or processes of this machine; for others see `beam_warp.plan.cluster`.
 
 All are driven in the same way: `Workers.start` gives one of them a task, `Workers.wait` returns what became of those
-that were given. A process that ends costs its task a try and is replaced.
+that were given. A process that ends costs its task a try and is replaced. Where the system can fork, one process imports
+what the work needs, and the others are forks of it: so they, and those that replace them, start at once. It never starts
+CUDA, which does not survive a fork.
 """
 
 from __future__ import annotations
@@ -29,6 +31,12 @@ from beam_warp.plan.steps import Plan, Receipt, Task, Work, perform, worker_name
 
 OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
 """Signals that come from outside; the others a process owes to what it does."""
+
+UNKNOWN_END = 255
+"""Exit code of a process that has outlived the one it was forked from: nobody knows how it ended."""
+
+MOST_STARTS = 10
+"""Times that a process is started anew because the one that it is forked from was killed meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +233,9 @@ class Processes:
         """
         self.count = len(settings)
         self._terms = terms
-        self._context = multiprocessing.get_context("spawn")
+        can_fork = "forkserver" in multiprocessing.get_all_start_methods()
+        self._context = multiprocessing.get_context("forkserver" if can_fork else "spawn")
+        self._context.set_forkserver_preload(_modules_of(works))
         self._packed = packed(works, terms)
         self._members = [self._member(setting) for setting in settings]
 
@@ -271,10 +281,15 @@ class Processes:
         """Return the numbers of the processes that live, for tests that kill some."""
         return [member.process.pid or 0 for member in self._members if member.process.is_alive()]
 
-    def _member(self, setting: Mapping[str, str]) -> _Member:
+    def _member(self, setting: Mapping[str, str], tries: int = MOST_STARTS) -> _Member:
         here, there = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(there, dict(setting)), daemon=True)
-        process.start()
+        process = self._context.Process(target=_serve, args=(there, {**os.environ, **setting}), daemon=True)
+        try:
+            process.start()
+        except (EOFError, OSError):  # what it is forked from was killed
+            if tries == 1:
+                raise
+            return self._member(setting, tries - 1)
         there.close()
         with suppress(OSError):
             here.send_bytes(self._packed)
@@ -300,13 +315,13 @@ class Processes:
         member.link.close()
         self._members[self._members.index(member)] = self._member(member.setting)
         code = member.process.exitcode or 0
-        if not member.is_ready and -code not in OUTSIDE_SIGNALS:
+        own = code != UNKNOWN_END and -code not in OUTSIDE_SIGNALS
+        if own and not member.is_ready:
             raise InvalidOptionError(
                 f"workers must start, got one that ended at once ({_ended(code)}). Try --workers 1 to see why."
             )
         if member.task is None:
             return []
-        own = -code not in OUTSIDE_SIGNALS
         return [Outcome(member.task.step.name, member.name, lost=_ended(code), is_own_fault=own)]
 
 
@@ -325,6 +340,12 @@ class _Member:
         return f"{worker_name().split(':')[0]}:{self.process.pid}"
 
 
+def _modules_of(works: Mapping[str, Work]) -> list[str]:
+    """Return the names of the modules that works, and what they hold, are defined in."""
+    held = [it for work in works.values() for it in (work, *vars(work).values())]
+    return sorted({type(it).__module__ for it in held} - {"__main__"})
+
+
 def _ended(code: int) -> str:
     """Return in words how a process ended, given its exit code."""
     if code < 0:
@@ -334,8 +355,9 @@ def _ended(code: int) -> str:
 
 
 def _serve(link: Any, setting: Mapping[str, str]) -> None:
-    """Do what the driver asks until it ends; the first message is the work, which is unpickled after the settings."""
+    """Do what the driver asks until it ends, in its environment; the first message is the work."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver hears it, and ends this process
+    os.environ.clear()
     os.environ.update(setting)
     tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
     content = link.recv_bytes()

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from support.storm_takes import processes_of
 from support.toy_work import toy_plan
 
 from beam_warp.errors import InvalidOptionError, OutputError, UnfinishedError
@@ -300,7 +301,7 @@ def begun(folder):
 def kill_one(driver, rng):
     """Kill a driver, or twice as likely one of its workers; return how many were there to be killed."""
     with suppress(psutil.NoSuchProcess):
-        workers = [it for it in psutil.Process(driver).children() if "spawn_main" in str(it.cmdline())]
+        workers = processes_of(driver)
         rng.choice([psutil.Process(driver), *workers, *workers]).kill()
         return 1
     return 0

@@ -1,4 +1,4 @@
-"""Takes of 20 frames that a storm of kills goes over: of steps that nap, or of small real ones; begun steps are noted."""
+"""Takes of 20 frames that a storm of kills goes over: of steps that nap, or of small real ones. Who begins says so."""
 
 import os
 import time
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import psutil
 from support.toy_work import toy_plan
 
 from beam_warp.jobs.listeners import no_progress
@@ -40,6 +41,12 @@ class Noted:
 
     def outputs(self, step):
         return self.work.outputs(step)
+
+
+def processes_of(driver):
+    """Return the processes that work for a driver: the server that workers are forked from, and these."""
+    found = psutil.Process(driver).children(recursive=True)
+    return [it for it in found if any(word in str(it.cmdline()) for word in ("forkserver", "spawn_main"))]
 
 
 def begun_file(out):
