@@ -1,9 +1,9 @@
 """Who does the steps of a plan: this process, or processes of this machine; for others see `beam_warp.plan.cluster`.
 
 All are driven in the same way: `Workers.start` gives one of them a task, `Workers.wait` returns what became of those
-that were given. A process that ends costs its task a try and is replaced. Where the system can fork, one process imports
-what the work needs, and the others are forks of it: so they, and those that replace them, start at once. It never starts
-CUDA, which does not survive a fork.
+that were given. A process that ends costs its task a try and is replaced. Where the system can fork, one process, the
+server, imports what the work needs, and the others are forks of it, so that they, and those that replace them, start at
+once. The server never starts CUDA, which does not survive a fork.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
 """Signals that come from outside; the others a process owes to what it does."""
 
 UNKNOWN_END = 255
-"""Exit code of a process that has outlived the one it was forked from: nobody knows how it ended."""
+"""Exit code of a process that has outlived its server: nobody knows how it ended."""
 
 MOST_STARTS = 10
-"""Times that a process is started anew because the one that it is forked from was killed meanwhile."""
+"""Times that a process is started anew because its server was killed meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,8 @@ class Processes:
         """Kill the process that does a step."""
         for member in self._members:
             if member.task is not None and member.task.step.name == name:
-                member.process.kill()
+                with suppress(ProcessLookupError):  # `Process.kill` takes who has outlived the server for ended
+                    os.kill(member.process.pid, OUTSIDE_SIGNALS[1])
 
     def now(self) -> float:
         """Return the time [s]."""
@@ -286,7 +287,7 @@ class Processes:
         process = self._context.Process(target=_serve, args=(there, {**os.environ, **setting}), daemon=True)
         try:
             process.start()
-        except (EOFError, OSError):  # what it is forked from was killed
+        except (EOFError, OSError):  # the server was killed
             if tries == 1:
                 raise
             return self._member(setting, tries - 1)
