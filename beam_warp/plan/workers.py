@@ -19,7 +19,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import connection
+from multiprocessing import connection, forkserver
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -31,6 +31,9 @@ from beam_warp.plan.steps import Plan, Receipt, Task, Work, perform, worker_name
 
 OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
 """Signals that come from outside; the others a process owes to what it does."""
+
+CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
+"""Whether there is a server that processes are forked from."""
 
 UNKNOWN_END = 255
 """Exit code of a process that has outlived its server: nobody knows how it ended."""
@@ -217,6 +220,13 @@ def wait_for_token(path: Path, patience: float = 5.0) -> None:
             time.sleep(0.1)
 
 
+def serve(modules: Sequence[str]) -> None:
+    """Start the server that processes are forked from, unless it runs; it imports modules while the caller goes on."""
+    if CAN_FORK and modules:
+        forkserver.set_forkserver_preload(list(modules))
+        forkserver.ensure_running()
+
+
 class Processes:
     """Processes of this machine, one for each entry of ``settings``; one that ends is replaced."""
 
@@ -233,10 +243,9 @@ class Processes:
         """
         self.count = len(settings)
         self._terms = terms
-        can_fork = "forkserver" in multiprocessing.get_all_start_methods()
-        self._context = multiprocessing.get_context("forkserver" if can_fork else "spawn")
-        self._context.set_forkserver_preload(_modules_of(works))
+        self._context = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
         self._packed = packed(works, terms)
+        serve(_modules_of(works))
         self._members = [self._member(setting) for setting in settings]
 
     def idle(self) -> list[str]:
