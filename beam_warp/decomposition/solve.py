@@ -86,7 +86,8 @@ class JointColor:
 def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> tuple[JointColor, dict[str, Any]]:
     """Solve one base colour for all frames, and find the Gaussians on which frames disagree.
 
-    Memory does not grow with the number of frames.
+    The solution of the first frame is stored; without such Gaussians it is that of all. Memory does not grow with the
+    number of frames.
 
     Returns:
         The colour, and facts: what `counts_of` says of the first frame, and `changes_of` of all.
@@ -104,7 +105,9 @@ def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> tuple[Joint
         change = test.result()
         constant = _solve(plan, first, joint, dispersion=change.dispersion)
         color = JointColor(constant, change)
-        shown = first.cloud.with_arrays(**color.of_frame(first).arrays())
+        solved = color.of_frame(first)
+        plan.archive.keep_solution(first.number, solved)
+        shown = first.cloud.with_arrays(**solved.arrays())
     return color, {"counts": [counts_of(first, shown, constant.clipped_part)], "changes": changes_of(change)}
 
 

@@ -114,7 +114,7 @@ class MaterialWork:
         numbers = self.frames.numbers()
         makers = [(material_step(number),) for number in numbers]
         if self._solves_later:
-            makers = [(material_step(it), solution_step(part[0])) for part in self._parts for it in part]
+            makers = [(material_step(it), "joint", solution_step(part[0])) for part in self._parts for it in part]
         shared = self.options.shared_roughness if self._may_be_persistent else None
         return ClipWork(self.folder, ASSET_STEM, self.finished, makers, numbers, shared)
 
@@ -279,7 +279,8 @@ class MaterialWork:
     def outputs(self, step: Step) -> tuple[Path, ...]:
         """Return the files of a step."""
         if step.frame is None:
-            return (self.stored(step.stage),)
+            is_solved = step.stage == "joint" and self._joint is not None
+            return (self.stored(step.stage), *([self.archive.solution_path(0)] if is_solved else []))
         index = self._place(step)
         if step.stage == "solution":
             return tuple(map(self.archive.solution_path, self._solved_by(index)))
@@ -341,9 +342,11 @@ class MaterialWork:
         return facts
 
     def _solved_by(self, first: int) -> range:
-        """Return the places of the frames that have solutions of their own, in the part that begins with one."""
-        end = len(self.frames.numbers()) if self.solved.is_varying else 1
-        return range(first, min(first + PART, end))
+        """Return the places of the frames that are solved after all others, in the part that begins with one."""
+        places = range(first, min(first + PART, len(self.frames.numbers())))
+        if self._joint is None:
+            return places
+        return places[first == 0 :] if self._joint.is_varying else places[:0]
 
     def _solve(self, places: Iterable[int]) -> dict[str, Any]:
         """Write the solutions of some frames."""
