@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from beam_warp.checks import require_count, require_number
 from beam_warp.errors import InvalidOptionError
-from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
-from beam_warp.render.sheet import Relighting
 from beam_warp.world.camera import MAX_SIDE
+
+if TYPE_CHECKING:
+    from beam_warp.materials.images import ImagePathOptions
+    from beam_warp.render.sheet import Relighting
 
 ESTIMATE = "estimate"
 

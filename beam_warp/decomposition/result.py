@@ -22,7 +22,6 @@ from beam_warp.jobs.report import device_facts, versions
 from beam_warp.materials.pilot import summary
 from beam_warp.plan.steps import Receipt
 from beam_warp.raster.records import RasterOptions
-from beam_warp.render.sheet import Relighting, contact_sheet
 from beam_warp.world.camera import Camera
 from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
@@ -117,6 +116,8 @@ def relightable_sequence(
 
 def draw_overview(path: Path, sequence: GaussianSequence, plan: JobPlan, options: OverviewOptions) -> None:
     """Draw the middle frame as captured and under two lights; panels are as wide as the subject needs."""
+    from beam_warp.render.sheet import Relighting, contact_sheet  # with renderers, which no step needs
+
     light = plan.light.prepared
     cloud = sequence[len(sequence) // 2]
     extent = np.ptp(bulk(cloud.positions, cloud.opacities), axis=0)

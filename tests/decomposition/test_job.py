@@ -105,7 +105,7 @@ def test_a_relighting_says_which_light_it_shows(tmp_path, light, monkeypatch, st
         titles.extend(shown.title for shown in lights)
         return np.zeros((8, 8, 3), np.uint8)
 
-    monkeypatch.setattr("beam_warp.decomposition.result.contact_sheet", sheet)
+    monkeypatch.setattr("beam_warp.render.sheet.contact_sheet", sheet)
     job(frames(0.0), light, tmp_path / "out", replace(FAST, exposure=stops))
     assert titles == [title, "relit by that light turned by 180°"]
 
@@ -448,7 +448,7 @@ class TestWithACapture:
             traced.append(found.ray_count)
             return found
 
-        monkeypatch.setattr("beam_warp.decomposition.measure.decompose_by_images", counted)
+        monkeypatch.setattr("beam_warp.materials.images.decompose_by_images", counted)
         darker = discs[0].with_arrays(opacities=discs[0].opacities * np.float32(0.5))
         changed = GaussianSequence.from_clouds([darker, discs[1]], metadata=discs.metadata)
         for sequence, resumed in ((discs, 0), (discs, 2), (changed, 0)):

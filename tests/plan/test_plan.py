@@ -341,7 +341,9 @@ def storm(folder, kills, workers, seed):
             arguments = [sys.executable, "-P", str(script), str(out), str(workers)]
             driver = subprocess.Popen(arguments, env={**os.environ, "PYTHONPATH": paths})
             while (code := driver.poll()) is None:
-                if killed < kills and (count := begun(out)) > seen:  # else nobody has begun anything that a kill could spoil
+                if (
+                    killed < kills and (count := begun(out)) > seen
+                ):  # else nobody has begun anything that a kill could spoil
                     seen = count
                     time.sleep(rng.uniform(0.0, 0.06))
                     killed += kill_one(driver.pid, rng)
