@@ -190,6 +190,25 @@ def test_persistent_frames_share_one_base_colour(tmp_path, light, whole):
     assert "base_color" not in separate.constant
 
 
+def test_colours_that_change_have_solutions_of_their_own(tmp_path, light, monkeypatch):
+    """Of a tenth of the Gaussians, colours blink; solutions are the same however many frames a step solves."""
+    blinks, found = np.arange(200) < 20, {}
+    clouds = [
+        frame().with_arrays(radiance=np.where(blinks, 0.9 * (-1) ** number - 0.3, 0.3)[:, None, None] * np.ones((1, 3)))
+        for number in range(5)
+    ]
+    for part in (2, 30):
+        monkeypatch.setattr("beam_warp.decomposition.work.PART", part)
+        found[part] = job(GaussianSequence.from_clouds(clouds), light, tmp_path / str(part))
+    sequence, report = found[2].sequence, found[2].report
+    assert report["materials"]["changing_part"] == pytest.approx(0.1)
+    assert "base_color" not in sequence.constant
+    change = np.abs(sequence[1].base_color - sequence[0].base_color).max(axis=1)
+    assert (change[blinks] > 0.1).all()
+    assert (change[~blinks] == 0.0).all()
+    assert folder_bytes(tmp_path / "2") == folder_bytes(tmp_path / "30")
+
+
 def test_the_image_path_needs_images(tmp_path, light):
     with pytest.raises(InvalidOptionError, match="capture must be given for the image path, got none"):
         job(frames(0.0), light, tmp_path / "out", RunOptions(images=ImagePathOptions()))
