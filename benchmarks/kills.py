@@ -47,7 +47,7 @@ Kill = Callable[[random.Random, int], tuple[str, int]]
 """Called with a driver's process; kills somebody, and returns what it was and its process."""
 
 DRIVER = "import sys; from support.storm_takes import drive; drive(*sys.argv[1:])"
-PACE = {"toy": 0.1, "real": 3.0}
+PACE = {"toy": 0.1, "real": 1.0}
 """Mean time from a step's beginning to the next kill [s]."""
 
 MACHINES = 3
