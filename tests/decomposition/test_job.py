@@ -191,7 +191,7 @@ def test_persistent_frames_share_one_base_colour(tmp_path, light, whole):
 
 
 def test_colours_that_change_have_solutions_of_their_own(tmp_path, light, monkeypatch):
-    """Of a tenth of the Gaussians, colours blink; solutions are the same however many frames a step solves."""
+    """A tenth of the Gaussians blink; solutions are the same however many frames a step solves."""
     blinks, found = np.arange(200) < 20, {}
     clouds = [
         frame().with_arrays(radiance=np.where(blinks, 0.9 * (-1) ** number - 0.3, 0.3)[:, None, None] * np.ones((1, 3)))

@@ -102,7 +102,7 @@ def draw_capture(folder):
 
 
 TAKES = {"toy": (toy,), "real": (partial(real, segment=SEGMENT), partial(real, segment=0))}
-"""By kind, takes that follow one another: of real steps, one in segments, and one of a single segment."""
+"""Takes that follow one another, by kind: of real steps, one in segments, and one of a single segment."""
 
 
 def drive(kind, number, out, words):
