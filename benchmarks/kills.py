@@ -43,8 +43,8 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.plan.standing import look
 
 Row = dict[str, Any]
-Kill = Callable[[random.Random, int], tuple[str, int]]
-"""Called with a driver's process; kills somebody, and returns what it was and its process."""
+Kill = Callable[[random.Random, int, set[int]], tuple[str, int]]
+"""Called with processes of a driver and of workers so far; kills somebody, and returns what it was and its process."""
 
 DRIVER = "import sys; from support.storm_takes import drive; drive(*sys.argv[1:])"
 PACE = {"toy": 0.1, "real": 1.0}
@@ -105,7 +105,7 @@ def storm(bench: Bench, workers: str, kill: Kill) -> Iterator[Row]:
                         lines = begun(out)
                         seen = len(lines)
                         with suppress(psutil.NoSuchProcess):
-                            what, process = kill(rng, driver.pid)
+                            what, process = kill(rng, driver.pid, {int(line.split()[1]) for line in lines})
                             killed[what] += 1
                             if what == "worker":
                                 stages = [line.split()[0] for line in lines if line.endswith(f" {process}")]
@@ -135,8 +135,8 @@ def storm(bench: Bench, workers: str, kill: Kill) -> Iterator[Row]:
 def processes(bench: Bench) -> Iterator[Row]:
     """Kill a driver, or twice as likely one of its three processes."""
 
-    def kill(rng: random.Random, driver: int) -> tuple[str, int]:
-        children = processes_of(driver)
+    def kill(rng: random.Random, driver: int, known: set[int]) -> tuple[str, int]:
+        children = processes_of(driver, known)
         chosen = rng.choice([psutil.Process(driver), *children, *children])
         workers = [child.pid for child in children if child.ppid() != driver]
         chosen.kill()
@@ -158,7 +158,7 @@ def cluster(bench: Bench) -> Iterator[Row]:
     try:
         machines = [_machine(found) for _ in range(MACHINES)]
 
-        def kill(rng: random.Random, driver: int) -> tuple[str, int]:
+        def kill(rng: random.Random, driver: int, known: set[int]) -> tuple[str, int]:
             what = rng.choice(["driver", "raylet", "worker", "worker"])
             actors = [
                 it for it in psutil.process_iter() if "_Actor" in it.name() or "_Actor" in "".join(it.cmdline()[:1])

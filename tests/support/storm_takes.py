@@ -2,6 +2,7 @@
 
 import os
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,10 +44,18 @@ class Noted:
         return self.work.outputs(step)
 
 
-def processes_of(driver):
-    """Return the processes that work for a driver: the server that workers are forked from, and these."""
-    found = psutil.Process(driver).children(recursive=True)
-    return [it for it in found if any(word in str(it.cmdline()) for word in ("forkserver", "spawn_main"))]
+def processes_of(driver, known=()):
+    """Return the processes that work for a driver: the server that workers are forked from, and these.
+
+    ``known`` are numbers of workers, of which some may have outlived their server.
+    """
+    found = {}
+    for number in (*(it.pid for it in psutil.Process(driver).children(recursive=True)), *known):
+        with suppress(psutil.NoSuchProcess):  # it has ended, and may wait for its parent to notice
+            process = psutil.Process(number)
+            if any(word in str(process.cmdline()) for word in ("forkserver", "spawn_main")):
+                found[number] = process
+    return list(found.values())
 
 
 def begun_file(out):
