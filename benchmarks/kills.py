@@ -105,6 +105,7 @@ def storm(bench: Bench, workers: str, kill: Kill) -> Iterator[Row]:
                         lines = begun(out)
                         seen = len(lines)
                         with suppress(psutil.NoSuchProcess):
+                            driver.poll()  # one that has ended is no process any more
                             what, process = kill(rng, driver.pid, {int(line.split()[1]) for line in lines})
                             killed[what] += 1
                             if what == "worker":
