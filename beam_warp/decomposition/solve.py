@@ -76,7 +76,7 @@ class JointColor:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> JointColor:
         """Return what was stored."""
-        values = {name: array if array.ndim else array.item() for name, array in arrays.items()}
+        values: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in arrays.items()}
         constant, change = (
             {field.name: values[field.name] for field in fields(kind)} for kind in (BaseColor, ColorChange)
         )
