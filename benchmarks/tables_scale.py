@@ -50,7 +50,7 @@ def kills(real: Row, processes: Row, cluster: Row) -> Rows:
     """Return how many were killed in takes of 20 frames that are whole, and what that cost."""
     rows: list[list[Any]] = [["", "steps", "killed are", "kills", "takes", "executions of a step"]]
     for name, steps, who, found in (
-        ("three processes", "real ones, small", "processes, drivers", real["processes"]),
+        ("three processes", "real ones, small", "processes, their server, drivers", real["processes"]),
         ("three processes", "naps", "processes, drivers", processes["processes"]),
         ("Ray cluster of three machines", "naps", "actors, machines, drivers", cluster["cluster"]),
     ):
