@@ -100,7 +100,8 @@ def storm(bench: Bench, workers: str, kill: Kill) -> Iterator[Row]:
                 driver = drive(number, out, workers)
                 seen = len(begun(out))
                 while (code := driver.poll()) is None:
-                    if len(begun(out)) > seen:  # else nobody has begun anything that a kill could spoil
+                    may_kill = killed.total() < bench.kills * (takes + 1) / kinds  # each kind of take has its share
+                    if may_kill and len(begun(out)) > seen:  # else nobody has begun anything that a kill could spoil
                         time.sleep(rng.uniform(0.0, 2.0 * PACE[bench.steps]))
                         lines = begun(out)
                         seen = len(lines)
