@@ -18,7 +18,7 @@ import json
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,9 @@ Row = dict[str, Any]
 RECONSTRUCTED, DECOMPOSED = "reconstruction_h200.json", "materials_cost_h200.json"
 ASSETS = ("gaussians", "asset")
 """Assets that a take becomes: what was reconstructed, and what can be relit. Both are charged as the larger one."""
+
+FADED = 2.0
+"""Gaussians of a frame where two segments overlap, over those of one."""
 
 FRAMES, WORKERS, SEGMENTS = 18_000, (1, 2, 8, 64, 256, 1024), (30, 120)
 
@@ -161,12 +164,15 @@ def take_steps(frames: int, segment: int) -> tuple[Step, ...]:
 
 
 def as_stages(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Return the steps with a stage of its own for key frames, which take longer."""
-    keys = [step.stage == "frame" and not step.inputs for step in steps]
-    return tuple(
-        Step(step.name, "key_frame" if is_key else step.stage, step.frame, step.inputs, step.rank)
-        for step, is_key in zip(steps, keys, strict=True)
-    )
+    """Return the steps with stages of their own for key frames, and for materials where two segments overlap."""
+
+    def stage(step: Step) -> str:
+        if step.stage == "frame" and not step.inputs:
+            return "key_frame"
+        fades = any(name.startswith("seam-") for name in step.inputs)
+        return "faded_materials" if step.stage == "materials" and fades else step.stage
+
+    return tuple(replace(step, stage=stage(step)) for step in steps)
 
 
 def takes(bench: Bench) -> Iterator[Row]:
@@ -178,6 +184,7 @@ def takes(bench: Bench) -> Iterator[Row]:
         "key_frame": known["key_frame"],
         **dict.fromkeys(("frame", "seam"), known["tracked_frame"]),
         "materials": known["materials"],
+        "faded_materials": FADED * known["materials"],
         "light": 0.0,
         "preview": 0.0,
         **{f"{asset}-{stage}": spent for asset in ASSETS for stage, spent in (("survey", survey), ("clip", clip))},
@@ -239,7 +246,8 @@ class Naps:
 
 def check(bench: Bench) -> Iterator[Row]:
     """Compare the simulation with processes that sleep through the plan of 16 segments, two assets included."""
-    seconds = {"key_frame": 12.0, "frame": 11.0, "seam": 11.0, "materials": 3.0, "light": 1.0, "preview": 1.0}
+    seconds = {"key_frame": 12.0, "frame": 11.0, "seam": 11.0, "light": 1.0, "preview": 1.0}
+    seconds |= {"materials": 3.0, "faded_materials": FADED * 3.0}
     seconds |= {f"{asset}-{stage}": 3.0 for asset in ASSETS for stage in ("survey", "clip", "whole")}
     naps = {stage: bench.nap * spent for stage, spent in seconds.items()}
     steps = as_stages(take_steps(16 * 5, 5))

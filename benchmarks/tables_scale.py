@@ -45,15 +45,16 @@ def asset_gigabytes(result: Row) -> float:
     return result["takes"]["frames"] * result["constants"]["written"]["bytes"] / 1e9
 
 
-@table("scale_kills", "kills_processes_cpu.json", "kills_cluster_cpu.json")
-def kills(processes: Row, cluster: Row) -> Rows:
+@table("scale_kills", "kills_real_cpu.json", "kills_processes_cpu.json", "kills_cluster_cpu.json")
+def kills(real: Row, processes: Row, cluster: Row) -> Rows:
     """Return how many were killed in takes of 20 frames that are whole, and what that cost."""
-    rows: list[list[Any]] = [["", "killed are", "kills", "takes", "executions of a step"]]
-    for name, who, found in (
-        ("three processes", "processes, drivers", processes["processes"]),
-        ("Ray cluster of three machines", "actors, machines, drivers", cluster["cluster"]),
+    rows: list[list[Any]] = [["", "steps", "killed are", "kills", "takes", "executions of a step"]]
+    for name, steps, who, found in (
+        ("three processes", "real ones, small", "processes, their server, drivers", real["processes"]),
+        ("three processes", "naps", "processes, drivers", processes["processes"]),
+        ("Ray cluster of three machines", "naps", "actors, machines, drivers", cluster["cluster"]),
     ):
-        rows.append([name, who, found["kills"], found["takes"], f"{found['executions'] / found['steps']:.2f}"])
+        rows.append([name, steps, who, found["kills"], found["takes"], f"{found['executions'] / found['steps']:.2f}"])
     return rows
 
 
@@ -76,6 +77,21 @@ def workers(result: Row) -> Rows:
             ]
         )
     return rows
+
+
+@table("scale_start", "start_cpu.json")
+def start(result: Row) -> Rows:
+    """Return how long a tiny take needs until its first step begins, and in all."""
+    parts = {
+        "before": "until the first step [s]",
+        "working": "steps [s]",
+        "after": "after them [s]",
+        "whole": "all [s]",
+    }
+    return [
+        ["workers", *parts.values()],
+        *([row["workers"], *(cell(row[name], ".1f") for name in parts)] for row in result["start"]["rows"]),
+    ]
 
 
 @table("scale_memory_receipts", "memory_cpu.json")

@@ -1,7 +1,8 @@
 """What workers make of a take: ``beam run`` of 24 cameras of 1080p by one process, and by one on each GPU.
 
-    python benchmarks/workers.py [--quick] [--frames N --segment-length N] [--workers WORD ...] --out result.json
+    python benchmarks/workers.py [--quick] [--parts PART] [--frames N --segment-length N] [--workers WORD ...] --out R
 
+``start``: how long a tiny take needs until its first step begins, and in all, kernels compiled before. ``take``:
 The take shows a few moments of `beam_warp.demo.capture` over and over. A first run of few small views compiles kernels.
 For each way of working: the seconds of each kind of step; the time before the first one, from the first one to the end
 of the last, and after it; frames an hour of one worker, and the efficiency against the first way, both by the time from
@@ -15,18 +16,21 @@ import functools
 import json
 import os
 import resource
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import record
 from parts import measure, say
+from timing import spread
 
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, dome_cameras, write_capture
 from beam_warp.demo.lights import studio
@@ -37,6 +41,7 @@ from beam_warp.plan.standing import look
 Row = dict[str, Any]
 
 BEAM = (sys.executable, "-P", "-c", "from beam_warp.cli.entry import beam; raise SystemExit(beam())")
+STARTS = 5
 KEPT = ("--cameras", "keep", "--masks", "keep", "--exposures", "keep", "--quiet")
 
 
@@ -142,9 +147,28 @@ def take(bench: Bench) -> Iterator[Row]:
         yield {**size, "width": bench.width, "height": bench.height, "gaussians": bench.gaussians, "rows": rows}
 
 
+def start(bench: Bench) -> Iterator[Row]:
+    """Start again and again: two frames of few small views, in two segments."""
+    tiny = replace(bench, segment=1, frames=2, more=("--preset", "draft"))
+    capture, rows = tiny.capture("tiny", 6, 48, 48, 2), list[Row]()
+    for workers in tiny.workers:
+        runs = list[Row]()
+        for _ in range(1 + STARTS):  # the first one compiles
+            runs.append(tiny.run(capture, workers, 300))
+            shutil.rmtree(runs[-1]["out"])
+        times = {name: spread(np.array([run[name] for run in runs[1:]])) for name in ("before", "working", "after")}
+        whole = spread(np.array([sum(run[name] for name in times) for run in runs[1:]]))
+        rows.append({"name": workers, "workers": runs[0]["workers"], **times, "whole": whole})
+        say(json.dumps(rows[-1]))
+        yield {"rows": rows}
+
+
+PARTS = {"start": start, "take": take}
+
+
 def main() -> None:
     """Measure, and write the result after every run."""
-    parser = record.parser(__doc__, quick="small images, to see whether it runs")
+    parser = record.parser(__doc__, quick="small images, to see whether it runs", parts=PARTS)
     parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--segment-length", type=int, default=3)
     parser.add_argument("--drawn", type=int, default=2, help="moments that are path traced")
@@ -157,7 +181,7 @@ def main() -> None:
     keep = functools.partial(record.write_result, arguments, resolve_device(None))
     with tempfile.TemporaryDirectory() as name:
         bench.place = Path(name)
-        measure({"take": take}, bench, keep=keep)
+        measure(PARTS, bench, only=arguments.parts, keep=keep)
 
 
 if __name__ == "__main__":

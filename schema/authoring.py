@@ -89,23 +89,28 @@ class AssetContents:
             total += rows * terms * CHANNELS[name].columns * width
         return total
 
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
+    def frames(
+        self, start: int = 0, stop: int | None = None, turned: NDArray[np.bool_] | None = None
+    ) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
         """Yield number and arrays of frames in order, all or some, as they are stored.
 
         With constant topology, a quaternion takes the sign that is nearer to its predecessor: engines that blend
-        components would otherwise spin the Gaussian. So only all frames of such a sequence can be asked for.
+        components would otherwise spin the Gaussian.
+
+        Args:
+            start: The first frame.
+            stop: The frame after the last one; None for all.
+            turned: Quaternions whose sign is turned in the first frame, ``(N,)``; see `turned_signs`. None for none.
         """
-        assert start == 0 or self.sequence.topology != "constant"
         keep_signs = self.sequence.topology == "constant" and "orientations" in self.survey.varying
         previous: NDArray[Any] | None = None
         for frame in range(len(self.sequence))[start:stop]:
-            arrays = self.stored(self.sequence[frame], self.varying)
+            cloud = self.sequence[frame]
+            arrays = self.stored(cloud, self.varying)
             if keep_signs:
-                current = arrays["orientations"]
-                if previous is not None:
-                    opposite = np.einsum("nk,nk->n", previous, current, dtype=np.float64) < 0.0
-                    current = np.where(opposite[:, None], -current, current)
-                previous = arrays["orientations"] = current
+                turned = turned_signs(previous, cloud.orientations, turned)
+                previous = cloud.orientations
+                arrays["orientations"] = np.where(turned[:, None], -arrays["orientations"], arrays["orientations"])
             yield frame, arrays
 
     def stored(self, cloud: GaussianCloud, names: Container[str]) -> dict[str, NDArray[Any]]:
@@ -120,6 +125,20 @@ class AssetContents:
         if "extent" in names:
             arrays["extent"] = kernel_extent(cloud.positions, cloud.orientations, cloud.scales)
         return arrays
+
+
+def turned_signs(
+    before: NDArray[np.floating] | None, after: NDArray[np.floating], turned: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """Return which quaternions of a frame are negated to be near those of the frame before, ``(N,)`` bool.
+
+    Args:
+        before: Quaternions of the frame before as they were given, ``(N, 4)``; None for the first frame.
+        after: Those of the frame, ``(N, 4)``.
+        turned: Which of the frame before are negated; None for none.
+    """
+    known = np.zeros(len(after), bool) if turned is None else turned
+    return known if before is None else known ^ (np.einsum("nk,nk->n", before, after, dtype=np.float64) < 0.0)
 
 
 def author_stage(layer: Sdf.Layer, contents: AssetContents) -> None:

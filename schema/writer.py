@@ -13,6 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf
 
@@ -143,14 +144,17 @@ class WrittenClips:
     folder: Path
 
 
-def write_clip(sequence: GaussianSequence, survey: Survey, start: int, path: Path) -> None:
+def write_clip(
+    sequence: GaussianSequence, survey: Survey, start: int, path: Path, turned: NDArray[np.bool_] | None = None
+) -> None:
     """Write one clip of an asset that `write_asset` then completes, the same bytes that it would write.
 
     Args:
-        sequence: As for `write_asset`, but its topology is not constant.
+        sequence: As for `write_asset`.
         survey: Properties of the sequence.
         start: The clip's first frame, a multiple of `CLIP_FRAMES`.
         path: The file, named by `clip_name`.
+        turned: With constant topology, quaternions whose sign is turned in the first frame; see `turned_signs`.
 
     Raises:
         OutputError: It cannot be written; nothing is left behind.
@@ -158,7 +162,7 @@ def write_clip(sequence: GaussianSequence, survey: Survey, start: int, path: Pat
     register()
     contents = AssetContents(sequence, survey, survey.half, CLIP_FRAMES)
     with replacing(path) as temporary:
-        _write_clip(contents, contents.frames(start, start + CLIP_FRAMES), temporary)
+        _write_clip(contents, contents.frames(start, start + CLIP_FRAMES, turned), temporary)
 
 
 def _write_clip(contents: AssetContents, frames: Iterable[tuple[int, Mapping[str, NDArray[Any]]]], path: Path) -> None:

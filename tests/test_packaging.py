@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import beam_warp
+from beam_warp.cli.reconstruct import STEP_MODULES
 
 ROOT = Path(__file__).parent.parent
 FOLDERS = {
@@ -66,6 +67,15 @@ def test_neither_import_nor_records_cost_warp_or_usd():
     after_import, after_records = (set(line.split()) for line in done.stdout.splitlines())
     assert not after_import & {"warp", "pxr", "scipy", "trimesh", "h5py", "OpenEXR", "skimage"}
     assert not after_records & {"warp", "pxr"}
+
+
+def test_steps_of_a_take_start_without_what_they_do_not_need():
+    """Renderers draw the overview at the end, OpenUSD writes clips, and the image path is an option."""
+    script = f"import sys, importlib\nfor name in {STEP_MODULES}: importlib.import_module(name)\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    loaded = set(done.stdout.split())
+    assert set(STEP_MODULES) <= loaded
+    assert not loaded & {"pxr", "beam_warp.render", "beam_warp.materials.images", "beam_warp.materials.bake"}
 
 
 FACES = sorted(

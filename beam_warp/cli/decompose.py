@@ -252,7 +252,6 @@ def run_options(
         InvalidOptionError: A texture comes without its mesh, or a mesh without its texture.
     """
     from beam_warp.decomposition.job import RunOptions
-    from beam_warp.materials.images import ImagePathOptions
     from beam_warp.materials.light_rays import MaterialOptions
     from beam_warp.materials.roughness_source import RoughnessTexture
 
@@ -270,9 +269,14 @@ def run_options(
     rays: dict[str, Any] = {"sample_count": measuring.samples, "offset": measuring.offset}
     rays = {name: value for name, value in rays.items() if value is not None}
     rays |= {} if measuring.bounce else {"bounce": False}
+    by_images = None
+    if preset == "paper":
+        from beam_warp.materials.images import ImagePathOptions
+
+        by_images = ImagePathOptions(seed=seed)
     return RunOptions(
         materials=MaterialOptions(**rays, seed=seed) if rays or preset == "direct" else None,
-        images=ImagePathOptions(seed=seed) if preset == "paper" else None,
+        images=by_images,
         roughness=roughness,
         exposure=measuring.exposure,
         turn_light=measuring.turn_light,
@@ -284,14 +288,13 @@ def run_options(
 def overview_options(measuring: Measuring) -> OverviewOptions:
     """Return what the contact sheet shows."""
     from beam_warp.decomposition.job import OverviewOptions
-    from beam_warp.render.sheet import Relighting
 
-    light = measuring.relight
-    return OverviewOptions(
-        second_light=None if light is None else Relighting(light.stem, EnvironmentMap.read(light)),
-        azimuth=measuring.orbit[0],
-        elevation=measuring.orbit[1],
-    )
+    light, second = measuring.relight, None
+    if light is not None:
+        from beam_warp.render.sheet import Relighting
+
+        second = Relighting(light.stem, EnvironmentMap.read(light))
+    return OverviewOptions(second_light=second, azimuth=measuring.orbit[0], elevation=measuring.orbit[1])
 
 
 def outcome(result: RunResult, seconds: float) -> str:

@@ -18,6 +18,7 @@ from beam_warp.cli.common.flags import Device, Json, Quiet, Seed, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.cli.common.targets import TargetFlags, state
 from beam_warp.errors import InvalidOptionError
+from beam_warp.plan.crew import crew_of
 from beam_warp.study.table import Settings
 from beam_warp.study.targets import Rung, Target, cheapest, climbed, fitted, in_words
 from beam_warp.world.environment import EnvironmentMap
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from beam_warp.reconstruction.job import ReconstructOptions
 
 USUAL_PRESET = "fast"
+
+STEP_MODULES = ("beam_warp.decomposition.work", "beam_warp.reconstruction.steps")
+"""What workers need for steps of reconstruction and materials."""
 
 PILOTS = 3
 """Settings that are tried where no error is asked."""
@@ -99,14 +103,13 @@ def reconstruct(args: Reconstruct) -> int:
     """Reconstruct and say what came out."""
     started = time.perf_counter()
     capture = Capture.read(args.capture)
+    crew = crew_of(args.workers, args.device, STEP_MODULES)
     options, target, chosen = options_of(args.modelling, capture), args.targets.target, None
     light = None if capture.environment_path is None else EnvironmentMap.read(capture.environment_path)
     asked = Asked(capture, args.seed, args.device, light)
 
-    from beam_warp.plan.crew import crew_of
     from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
 
-    crew = crew_of(args.workers, args.device)
     modelling = args.modelling
     with progress(args.quiet or args.json) as report:
         if target is not None:

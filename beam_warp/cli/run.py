@@ -28,9 +28,19 @@ from beam_warp.cli.decompose import (
     state_target,
     with_rays,
 )
-from beam_warp.cli.reconstruct import Asked, Modelling, modelling_for, options_of, steps_of, summary, with_modelling
+from beam_warp.cli.reconstruct import (
+    STEP_MODULES,
+    Asked,
+    Modelling,
+    modelling_for,
+    options_of,
+    steps_of,
+    summary,
+    with_modelling,
+)
 from beam_warp.converters.numbering import SOG_NAMES, holds_gaussians
 from beam_warp.errors import InvalidOptionError, MissingFileError
+from beam_warp.plan.crew import crew_of
 from beam_warp.study.targets import Target
 from beam_warp.world.environment import EnvironmentMap
 
@@ -86,6 +96,7 @@ def run(args: Run) -> int:
     capture = capture_at(args.input)
     _check_words(args, capture)
     light = light_of(args.measuring, capture, args.input)
+    crew = crew_of(args.workers, args.device, STEP_MODULES)
     environment = EnvironmentMap.read(light).rotated(args.measuring.rotate)
     if args.fps is not None:
         require_number("frames_per_second", args.fps, 1e-3, 1e6)
@@ -93,10 +104,9 @@ def run(args: Run) -> int:
     from beam_warp.decomposition.frames import GivenFrames, ReconstructedFrames
     from beam_warp.decomposition.job import run_capture, run_materials
     from beam_warp.decomposition.work import MaterialWork
-    from beam_warp.plan.crew import crew_of
     from beam_warp.reconstruction.job import reconstruct as reconstruct_capture
 
-    crew, target = crew_of(args.workers, args.device), args.targets.target
+    target = args.targets.target
     if target is not None and target.fps is not None and capture is not None:
         raise InvalidOptionError(
             f"target-fps must be left out for a capture, got {target.fps:g}: both its jobs take time. Give "

@@ -7,8 +7,8 @@
     solve     `beam_warp.decomposition.solve`           base colour from the evidence
     write     `beam_warp.decomposition.result`          asset, contact sheet and report
 
-The first four are steps of a plan (`beam_warp.decomposition.work`), which says what of them is done: a stopped job
-continues. What they find is kept in a folder (`beam_warp.decomposition.archive`), from which the last two read.
+The first five are steps of a plan (`beam_warp.decomposition.work`), which says what of them is done: a stopped job
+continues. What they find is kept in a folder (`beam_warp.decomposition.archive`), from which the last one reads.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ from beam_warp.converters.numbering import ASSET_NAME
 from beam_warp.converters.staging import require_writable
 from beam_warp.decomposition.frames import GivenFrames
 from beam_warp.decomposition.options import OverviewOptions, RunOptions
-from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.result import Measurements, draw_overview, relightable_sequence, run_report
-from beam_warp.decomposition.solve import SolvedFrames, solve_frame, solve_jointly, take, take_each
 from beam_warp.decomposition.work import MaterialWork
 from beam_warp.device.arrays import resolve_device
 from beam_warp.jobs.listeners import StageProgress, no_progress
@@ -186,16 +184,16 @@ def _prepare(work: MaterialWork) -> list[str]:
 def _finish(
     work: MaterialWork, receipts: Mapping[str, Receipt], notes: list[str], overview: OverviewOptions, started: float
 ) -> RunResult:
-    """Solve for base colour where frames share it, and write asset, contact sheet and report."""
+    """Write asset, contact sheet and report."""
     from beam_warp.schema.staging import publish_asset, staged_folder  # with OpenUSD, which nothing before needs
 
-    source = replace(work.source, sequence=work.frames.whole())
+    source = replace(work.source, sequence=work.whole)
     plan, out, log = replace(work.job, source=source), work.folder, source.log
     made = Measurements.of(receipts, work.frames.numbers())
     notes = [*notes, *(work.images.notes if work.images is not None else ())]
     notes += plan.archive.remove_beyond(len(source.sequence))
-    solved, persistent = _solve(work, plan, made)
-    relightable = relightable_sequence(plan, solved, persistent=persistent)
+    persistent = work.are_persistent
+    relightable = relightable_sequence(plan, work.solved, made.statistics, persistent=persistent)
     with staged_folder(out / "results") as staged:  # all of them appear, or none
         with log.timer("write asset"):
             layers = work.clips.write(relightable, staged / ASSET_NAME, receipts)
@@ -204,21 +202,8 @@ def _finish(
             draw_overview(staged / OVERVIEW_NAME, relightable, plan, overview)
             work.progress("overview", 1, 1)
         seconds = time.perf_counter() - started
-        report = run_report(plan, made, solved, findings=work.findings(), persistent=persistent, seconds=seconds)
+        report = run_report(plan, made, findings=work.findings(), persistent=persistent, seconds=seconds)
         report["input"]["notes"] += notes
         write_report(staged, report)
         publish_asset(staged, [REPORT_NAME, OVERVIEW_NAME, *(path.name for path in layers)], out)
     return RunResult(out / ASSET_NAME, out / OVERVIEW_NAME, relightable, plan.light.environment, report)
-
-
-def _solve(work: MaterialWork, plan: JobPlan, made: Measurements) -> tuple[SolvedFrames, bool]:
-    """Return the frames with base colour, and whether row i is the same Gaussian in all of them."""
-    persistent = work.options.persistent or plan.source.sequence.topology == "constant"
-    frames = map(plan.archive.read, range(len(plan.source.sequence)))
-    if work.options.images is not None:
-        return take(plan, frames), persistent
-    if persistent:
-        return solve_jointly(plan, frames), persistent
-    if work.solves:
-        return take_each(plan, made.counts), persistent
-    return take_each(plan, [solve_frame(plan, frame) for frame in frames]), persistent  # tracking was lost

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,10 @@ from beam_warp.decomposition.archive import MeasuredFrame
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.seen import SeenFrame
 from beam_warp.materials.direct import ColorEvidence, measure_materials
-from beam_warp.materials.images import ImagePathOptions, decompose_by_images
 from beam_warp.world.gaussians import Observability
+
+if TYPE_CHECKING:
+    from beam_warp.materials.images import ImagePathOptions
 
 UNMEASURED = Observability.UNSEEN | Observability.FILLED
 
@@ -79,6 +81,8 @@ class FrameMeasurement:
         self, frame: SeenFrame, options: ImagePathOptions, previous: MeasuredFrame | None
     ) -> dict[str, NDArray[Any]]:
         """Measure a frame by rays from the pixels of its views, baked into its Gaussians: all materials at once."""
+        from beam_warp.materials.images import decompose_by_images  # with kernels that the direct path does not need
+
         assert frame.capture is not None
         scene, roughness = frame.scene, self.roughness
         views = frame.images()

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from beam_warp.checks import require_count, require_number
 from beam_warp.errors import InvalidOptionError
-from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.roughness_source import RoughnessTexture
-from beam_warp.render.sheet import Relighting
 from beam_warp.world.camera import MAX_SIDE
+
+if TYPE_CHECKING:
+    from beam_warp.materials.images import ImagePathOptions
+    from beam_warp.render.sheet import Relighting
 
 ESTIMATE = "estimate"
 
@@ -67,6 +69,11 @@ class RunOptions:
         if isinstance(self.roughness, RoughnessTexture):
             return "texture"
         return "estimated" if self.roughness == ESTIMATE else "constant"
+
+    @property
+    def shared_roughness(self) -> frozenset[str]:
+        """Names of the arrays of roughness that persistent Gaussians have in common."""
+        return frozenset({"roughness", "roughness_error"} if self.roughness == ESTIMATE else {"roughness"})
 
     @property
     def gathering(self) -> MaterialOptions:

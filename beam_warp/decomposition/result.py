@@ -11,17 +11,17 @@ import numpy as np
 
 from beam_warp._version import __version__
 from beam_warp.capture.findings import Finding
-from beam_warp.decomposition.options import ESTIMATE, OverviewOptions
+from beam_warp.decomposition.options import OverviewOptions
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.solve import SolvedFrames
+from beam_warp.decomposition.tally import summary as tally
 from beam_warp.decomposition.tally import warnings_about
-from beam_warp.decomposition.work import material_step
+from beam_warp.decomposition.work import material_step, solution_step
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
 from beam_warp.materials.pilot import summary
 from beam_warp.plan.steps import Receipt
 from beam_warp.raster.records import RasterOptions
-from beam_warp.render.sheet import Relighting, contact_sheet
 from beam_warp.world.camera import Camera
 from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
@@ -36,7 +36,7 @@ class Measurements:
         ray_count: Rays of light and occlusion that were traced for the others.
         economy: What fewer rays for some Gaussians have left out, over all frames.
         notes: What a reader of the result should know.
-        counts: Sums over each frame that was solved by itself; see `beam_warp.decomposition.tally.counts_of`.
+        statistics: Over all frames; see `beam_warp.decomposition.tally.summary`.
         roughness: How the last estimate of roughness came about; empty if none was made.
         seconds: By stage, spent by all workers on steps of this call.
         workers: Machines and processes that did the steps.
@@ -46,7 +46,7 @@ class Measurements:
     ray_count: int
     economy: dict[str, Any]
     notes: list[str]
-    counts: list[dict[str, Any]]
+    statistics: dict[str, Any]
     roughness: dict[str, Any]
     seconds: dict[str, float]
     workers: list[str]
@@ -54,10 +54,13 @@ class Measurements:
     @classmethod
     def of(cls, receipts: Mapping[str, Receipt], numbers: Sequence[int]) -> Measurements:
         """Add up the receipts of all steps, given what the frames are called."""
-        shared = [receipts[name] for name in ("light", "roughness") if name in receipts]
+        names = ("light", "roughness", "joint", *map(solution_step, numbers))
+        shared = [receipts[name] for name in names if name in receipts]
         frames = [receipts[material_step(number)] for number in numbers]
         steps = [(step, dict(step.facts)) for step in (*shared, *frames)]  # which reads them, once
         said = [facts for _, facts in steps[len(shared) :]]
+        counts = [frame for _, facts in steps for frame in facts.get("counts", ())]
+        changes = next((facts["changes"] for _, facts in steps if "changes" in facts), {})
         estimates = [facts["roughness"] for _, facts in steps if "roughness" in facts]
         seconds: dict[str, float] = {}
         for step, facts in steps:
@@ -68,19 +71,22 @@ class Measurements:
             ray_count=sum(facts["ray_count"] for frame, facts in zip(frames, said, strict=True) if not frame.is_kept),
             economy=summary([facts["economy"] for facts in said]),
             notes=list(dict.fromkeys(note for facts in said for note in facts["notes"])),
-            counts=[facts.get("counts", {}) for facts in said],
+            statistics=tally(counts, changes),
             roughness=estimates[-1] if estimates else {},
             seconds=seconds,
             workers=sorted({step.worker for step, _ in steps}),
         )
 
 
-def relightable_sequence(plan: JobPlan, solved: SolvedFrames, *, persistent: bool) -> GaussianSequence:
+def relightable_sequence(
+    plan: JobPlan, solved: SolvedFrames, statistics: Mapping[str, Any], *, persistent: bool
+) -> GaussianSequence:
     """Return the frames that were solved as a sequence, read lazily, in the world's axes.
 
     Args:
         plan: The job.
         solved: Its frames.
+        statistics: Over all frames.
         persistent: Whether row i is the same Gaussian in every frame.
     """
     sequence, options = plan.source.sequence, plan.source.options
@@ -88,7 +94,7 @@ def relightable_sequence(plan: JobPlan, solved: SolvedFrames, *, persistent: boo
     if not solved.is_varying:
         shared |= {"base_color", "base_color_error", "observability"}
     if persistent:
-        shared |= {"roughness", "roughness_error"} if options.roughness == ESTIMATE else {"roughness"}
+        shared |= options.shared_roughness
     return GaussianSequence(
         frame_count=len(sequence),
         read_frame=solved.cloud,
@@ -98,7 +104,7 @@ def relightable_sequence(plan: JobPlan, solved: SolvedFrames, *, persistent: boo
         metadata={
             **sequence.metadata,
             "generator": f"beam-warp {__version__}",
-            "normal_source": "shortestAxis" if solved.statistics["normals_from_shape"] > 0.5 else "authored",
+            "normal_source": "shortestAxis" if statistics["normals_from_shape"] > 0.5 else "authored",
             "roughness_source": options.roughness_source,
             "radiance_meaning": "captured",
             "source_axes": plan.source.first.original.axes,
@@ -110,6 +116,8 @@ def relightable_sequence(plan: JobPlan, solved: SolvedFrames, *, persistent: boo
 
 def draw_overview(path: Path, sequence: GaussianSequence, plan: JobPlan, options: OverviewOptions) -> None:
     """Draw the middle frame as captured and under two lights; panels are as wide as the subject needs."""
+    from beam_warp.render.sheet import Relighting, contact_sheet  # with renderers, which no step needs
+
     light = plan.light.prepared
     cloud = sequence[len(sequence) // 2]
     extent = np.ptp(bulk(cloud.positions, cloud.opacities), axis=0)
@@ -141,20 +149,13 @@ def _light_in_words(plan: JobPlan) -> str:
 
 
 def run_report(
-    plan: JobPlan,
-    made: Measurements,
-    solved: SolvedFrames,
-    *,
-    findings: list[dict[str, Any]],
-    persistent: bool,
-    seconds: float,
+    plan: JobPlan, made: Measurements, *, findings: list[dict[str, Any]], persistent: bool, seconds: float
 ) -> dict[str, Any]:
     """Return what was done, found and spent, JSON-able.
 
     Args:
         plan: The job.
         made: What its steps said.
-        solved: Its relightable frames.
         findings: Findings about the light and the images.
         persistent: Whether row i is the same Gaussian in every frame.
         seconds: Duration of the whole job.
@@ -175,13 +176,13 @@ def run_report(
         **plan.light.as_record(),
         "resumed_frames": made.resumed,
         "persistent": persistent,
-        "materials": solved.statistics,
+        "materials": made.statistics,
         "roughness": made.roughness,
         "economy": made.economy,
         "seconds": {**stages, "total": seconds},
         "light_and_occlusion_rays_per_second": made.ray_count / traced if traced > 0.0 else None,
         "findings": findings,
-        "warnings": [*_lines(findings, "warning"), *warnings_about(solved.statistics)],
+        "warnings": [*_lines(findings, "warning"), *warnings_about(made.statistics)],
     }
 
 

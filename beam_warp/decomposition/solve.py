@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from beam_warp.decomposition.archive import FrameArchive, MeasuredFrame
 from beam_warp.decomposition.plan import JobPlan
-from beam_warp.decomposition.tally import MaterialTally, counts_of
+from beam_warp.decomposition.tally import changes_of, counts_of
 from beam_warp.materials.base_color import BaseColor, solve_base_color
-from beam_warp.materials.changes import ChangeTest, with_changes
+from beam_warp.materials.changes import ChangeTest, ColorChange, with_changes
 from beam_warp.materials.direct import ColorEvidence
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -23,13 +26,11 @@ class SolvedFrames:
         archive: Where their measurements and solutions are.
         has_solutions: Whether base colour was solved; on the image path it was measured with everything else.
         is_varying: Whether frames have base colours of their own.
-        statistics: See `beam_warp.decomposition.tally.MaterialTally.summary`.
     """
 
     archive: FrameArchive
     has_solutions: bool
     is_varying: bool
-    statistics: dict[str, Any]
 
     def cloud(self, number: int) -> GaussianCloud:
         """Read a frame."""
@@ -37,12 +38,6 @@ class SolvedFrames:
         if not self.has_solutions:
             return cloud
         return cloud.with_arrays(**self.archive.solution(number if self.is_varying else 0))
-
-
-def take(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
-    """Take frames of the image path as they are."""
-    counts = (counts_of(frame, frame.cloud) for frame in frames)
-    return SolvedFrames(plan.archive, False, True, _added(counts).summary())
 
 
 def solve_frame(plan: JobPlan, frame: MeasuredFrame) -> dict[str, Any]:
@@ -53,46 +48,67 @@ def solve_frame(plan: JobPlan, frame: MeasuredFrame) -> dict[str, Any]:
     return counts_of(frame, frame.cloud.with_arrays(**solved.arrays()), solved.clipped_part)
 
 
-def take_each(plan: JobPlan, counts: Iterable[Mapping[str, Any]]) -> SolvedFrames:
-    """Take frames that were solved by themselves, given what `counts_of` says of each."""
-    return SolvedFrames(plan.archive, True, True, _added(counts).summary())
+@dataclass(frozen=True, eq=False)
+class JointColor:
+    """Base colour of Gaussians that are the same in all frames.
 
-
-def _added(counts: Iterable[Mapping[str, Any]]) -> MaterialTally:
-    tally = MaterialTally()
-    for frame in counts:
-        tally.add(frame)
-    return tally
-
-
-def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> SolvedFrames:
-    """Solve one base colour for all frames, and one a frame for Gaussians on which frames disagree.
-
-    Solutions are stored. Memory does not grow with the number of frames: if some Gaussian changes, they are read again.
+    Attributes:
+        constant: Solved over all frames.
+        change: On which Gaussians frames disagree, so that each has a colour of its own.
     """
-    first, joint, test, count = None, None, ChangeTest(), 0
+
+    constant: BaseColor
+    change: ColorChange
+
+    @property
+    def is_varying(self) -> bool:
+        """Whether frames disagree on any."""
+        return bool(self.change.changing.any())
+
+    def of_frame(self, frame: MeasuredFrame) -> BaseColor:
+        """Return the base colour of a frame."""
+        return with_changes(self.constant, self.change, _evidence(frame))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all of it as arrays to be stored."""
+        return {name: np.asarray(array) for part in (self.constant, self.change) for name, array in vars(part).items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> JointColor:
+        """Return what was stored."""
+        values: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in arrays.items()}
+        constant, change = (
+            {field.name: values[field.name] for field in fields(kind)} for kind in (BaseColor, ColorChange)
+        )
+        return cls(BaseColor(**constant), ColorChange(**change))
+
+
+def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> tuple[JointColor, dict[str, Any]]:
+    """Solve one base colour for all frames, and find the Gaussians on which frames disagree.
+
+    The solution of the first frame is stored; without such Gaussians it is that of all. Memory does not grow with the
+    number of frames.
+
+    Returns:
+        The colour, and facts: what `counts_of` says of the first frame, and `changes_of` of all.
+    """
+    first, joint, test = None, None, ChangeTest()
     for frame in frames:
         with plan.source.log.timer("solve"):
             evidence = _evidence(frame)
             first = first or frame
             joint = evidence if joint is None else joint + evidence
             test.add(evidence)
-            count += 1
     assert first is not None
     assert joint is not None
-    tally = MaterialTally()
     with plan.source.log.timer("solve"):
         change = test.result()
         constant = _solve(plan, first, joint, dispersion=change.dispersion)
-        is_varying = bool(change.changing.any())
-        for number in range(count if is_varying else 1):
-            frame = first if number == 0 else plan.archive.read(number)
-            solved = with_changes(constant, change, _evidence(frame))
-            plan.archive.keep_solution(number, solved)
-            if number == 0:
-                tally.add(counts_of(first, first.cloud.with_arrays(**solved.arrays()), constant.clipped_part))
-    tally.count_changes(change)
-    return SolvedFrames(plan.archive, True, is_varying, tally.summary())
+        color = JointColor(constant, change)
+        solved = color.of_frame(first)
+        plan.archive.keep_solution(first.number, solved)
+        shown = first.cloud.with_arrays(**solved.arrays())
+    return color, {"counts": [counts_of(first, shown, constant.clipped_part)], "changes": changes_of(change)}
 
 
 def _solve(plan: JobPlan, frame: MeasuredFrame, evidence: ColorEvidence, *, dispersion: float = 1.0) -> BaseColor:

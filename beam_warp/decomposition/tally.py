@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ UNCERTAIN_WARNING = 0.5
 
 
 def warnings_about(statistics: Mapping[str, Any]) -> list[str]:
-    """Return what a user should know about a tally's `MaterialTally.summary`."""
+    """Return what a user should know about what `summary` returns."""
     warnings = []
     if statistics["clipped_part"] > CLIPPED_WARNING:
         warnings.append(
@@ -36,43 +36,33 @@ def warnings_about(statistics: Mapping[str, Any]) -> list[str]:
     return warnings
 
 
-class MaterialTally:
-    """Counts over frames, so that a report needs no frame twice."""
+def changes_of(change: ColorChange) -> dict[str, float]:
+    """Return what a test of frames against each other found, JSON-able."""
+    return {"changing_part": float(change.changing.mean()), "error_dispersion": change.dispersion}
 
-    def __init__(self) -> None:
-        """Start with nothing counted."""
-        self._rows = 0
-        self._sums: dict[str, float] = {}
-        self._changes: dict[str, float] = {}
-        self._flags = {flag.name: 0 for flag in Observability if flag and flag.name}
 
-    def add(self, counts: Mapping[str, Any]) -> None:
-        """Count one frame, given what `counts_of` says of it."""
-        self._rows += counts["rows"]
-        for name, value in counts["sums"].items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
-        for name, value in counts["flags"].items():
-            self._flags[name] += value
+def summary(counts: Sequence[Mapping[str, Any]], changes: Mapping[str, float]) -> dict[str, Any]:
+    """Return parts, means and counts over frames, JSON-able.
 
-    def count_changes(self, change: ColorChange) -> None:
-        """Keep what a test of frames against each other found."""
-        self._changes = {"changing_part": float(change.changing.mean()), "error_dispersion": change.dispersion}
-
-    def summary(self) -> dict[str, Any]:
-        """Return parts, means and counts over all frames, JSON-able."""
-        rows = max(self._rows, 1)
-        return {
-            "gaussians": self._rows,
-            "clipped_part": self._sums["clipped"] / rows,
-            "normals_from_shape": self._sums["from_shape"] / rows,
-            "mean_ambient_occlusion": self._sums["openness"] / rows,
-            "mean_normal_confidence": self._sums["confidence"] / rows,
-            "mean_base_color_error_where_measured": self._sums["error"] / max(self._sums["measured"], 1.0),
-            "dropped_transparent": int(self._sums["dropped"]),
-            "raised_scales": int(self._sums["raised"]),
-            "flags": self._flags,
-            **self._changes,
-        }
+    Args:
+        counts: What `counts_of` says of each.
+        changes: What `changes_of` says of all.
+    """
+    total = sum(frame["rows"] for frame in counts)
+    rows = max(total, 1)
+    sums = {name: sum(frame["sums"][name] for frame in counts) for name in counts[0]["sums"]}
+    return {
+        "gaussians": total,
+        "clipped_part": sums["clipped"] / rows,
+        "normals_from_shape": sums["from_shape"] / rows,
+        "mean_ambient_occlusion": sums["openness"] / rows,
+        "mean_normal_confidence": sums["confidence"] / rows,
+        "mean_base_color_error_where_measured": sums["error"] / max(sums["measured"], 1.0),
+        "dropped_transparent": int(sums["dropped"]),
+        "raised_scales": int(sums["raised"]),
+        "flags": {name: sum(frame["flags"][name] for frame in counts) for name in counts[0]["flags"]},
+        **changes,
+    }
 
 
 def counts_of(frame: MeasuredFrame, cloud: GaussianCloud, clipped_part: float = 0.0) -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""Steps of the main job: the light, the roughness of persistent Gaussians, and the materials of each frame."""
+"""Steps of the main job: the light, the roughness of persistent Gaussians, the materials of each frame, base colour."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -25,8 +25,9 @@ from beam_warp.decomposition.options import ESTIMATE, RunOptions
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.roughness_finder import asked_frames, find_roughness
 from beam_warp.decomposition.seen import SeenFrame
-from beam_warp.decomposition.solve import solve_frame
+from beam_warp.decomposition.solve import JointColor, SolvedFrames, solve_frame, solve_jointly
 from beam_warp.decomposition.source import Source
+from beam_warp.decomposition.tally import counts_of
 from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
@@ -44,7 +45,10 @@ from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 
 ASSET_STEM = Path(ASSET_NAME).stem
 
-STAGES = ("light", "roughness", "materials")
+STAGES = ("light", "roughness", "materials", "joint", "solution")
+
+PART = 30
+"""Frames of persistent Gaussians whose solutions a step writes: they take a moment each."""
 
 
 @dataclass(eq=False)
@@ -97,25 +101,68 @@ class MaterialWork:
             before = (material_step(numbers[index - 1]),) if index and self._follows else ()
             inputs = (*shared, *made[index], *before)
             steps.append(Step(material_step(number), "materials", number, inputs, Rank.MATERIALS))
+        if self._solves_later:
+            steps.append(Step("joint", "joint", None, tuple(map(material_step, numbers)), Rank.SHARED))
+            for part in self._parts:
+                inputs = ("joint", *map(material_step, part))
+                steps.append(Step(solution_step(part[0]), "solution", part[0], inputs, Rank.PREVIEW))
         return Plan(self.folder, tuple(steps), dict.fromkeys(STAGES, self)).with_steps_of(self.clips.plan())
 
     @cached_property
     def clips(self) -> ClipWork:
-        """Steps that write the asset of frames that are solved one by one; others are known when all are measured."""
-        names = self.measured() if self.solves else []
-        return ClipWork(self.folder, ASSET_STEM, self.solved, [(name,) for name in names], self.frames.numbers())
+        """Steps that write the asset."""
+        numbers = self.frames.numbers()
+        makers = [(material_step(number),) for number in numbers]
+        if self._solves_later:
+            makers = [(material_step(it), "joint", solution_step(part[0])) for part in self._parts for it in part]
+        shared = self.options.shared_roughness if self._may_be_persistent else None
+        return ClipWork(self.folder, ASSET_STEM, self.finished, makers, numbers, shared)
 
-    def solved(self) -> GaussianSequence:
-        """Return the frames that were solved one by one, each to be read when it is done; without metadata."""
+    def finished(self) -> GaussianSequence:
+        """Return the frames with base colour, each to be read when it is done; without metadata."""
         sequence = self.frames.sequence()
+        is_constant = self.options.persistent or sequence.topology == "constant"
         return GaussianSequence(
             frame_count=len(sequence),
-            read_frame=lambda number: self.archive.solved(number),
+            read_frame=lambda number: self.solved.cloud(number),
             frames_per_second=sequence.frames_per_second,
             constant=sequence.constant & set(ATTRIBUTES) - {"normals"},
-            topology="perFrame",
+            topology="constant" if is_constant else "perFrame",
             metadata={},
         )
+
+    @cached_property
+    def solved(self) -> SolvedFrames:
+        """The frames with base colour, when all that is solved over all of them is."""
+        is_varying = not self._solves_later or self._joint is None or self._joint.is_varying
+        return SolvedFrames(self.archive, self.options.images is None, is_varying)
+
+    @cached_property
+    def whole(self) -> GaussianSequence:
+        """The frames, when all are made."""
+        return self.frames.whole()
+
+    @property
+    def are_persistent(self) -> bool:
+        """Whether row i is the same Gaussian in every frame, when all are made."""
+        return self.options.persistent or self.whole.topology == "constant"
+
+    @cached_property
+    def _joint(self) -> JointColor | None:
+        """What was solved over all frames; None where tracking was lost, so that each was solved by itself."""
+        arrays = read_frame(self.stored("joint"))
+        return JointColor.from_arrays(arrays) if arrays else None
+
+    @cached_property
+    def _parts(self) -> list[tuple[int, ...]]:
+        """Numbers of the frames whose solutions are written together."""
+        numbers = self.frames.numbers()
+        return [numbers[start : start + PART] for start in range(0, len(numbers), PART)]
+
+    @property
+    def _solves_later(self) -> bool:
+        """Whether base colour is solved when all frames are measured, over all of them if they are persistent."""
+        return self.options.images is None and self._may_be_persistent
 
     @property
     def _may_be_persistent(self) -> bool:
@@ -202,6 +249,8 @@ class MaterialWork:
         if step.stage == "light":
             text = self._frame_digest(0) + str(self.source.is_display_referred())
             return array_digest(self.environment.radiance, text=f"{text} {self.source.has_light}")
+        if step.stage in ("joint", "solution"):
+            return ""
         if step.stage == "roughness":
             return " ".join(map(self._frame_digest, asked_frames(len(self.source.sequence))))
         return f"{self.solves} {self._frame_digest(self._place(step))}"
@@ -230,8 +279,11 @@ class MaterialWork:
     def outputs(self, step: Step) -> tuple[Path, ...]:
         """Return the files of a step."""
         if step.frame is None:
-            return (self.stored(step.stage),)
+            is_solved = step.stage == "joint" and self._joint is not None
+            return (self.stored(step.stage), *([self.archive.solution_path(0)] if is_solved else []))
         index = self._place(step)
+        if step.stage == "solution":
+            return tuple(map(self.archive.solution_path, self._solved_by(index)))
         return (self.archive.frame_path(index), *([self.archive.solution_path(index)] if self.solves else []))
 
     def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
@@ -242,6 +294,10 @@ class MaterialWork:
             facts = self._find_light()
         elif task.step.stage == "roughness":
             facts = self._find_roughness()
+        elif task.step.stage == "joint":
+            facts = self._solve_jointly()
+        elif task.step.stage == "solution":
+            facts = self._solve(self._solved_by(self._place(task.step)))
         else:
             facts = self._measure(self._place(task.step))
         facts = {**facts, "seconds": dict(seconds)}
@@ -255,7 +311,7 @@ class MaterialWork:
 
     def _find_roughness(self) -> dict[str, Any]:
         """Find what persistent Gaussians share; nothing where tracking was lost, so that they are not persistent."""
-        if not (self.options.persistent or self.frames.whole().topology == "constant"):
+        if not self.are_persistent:
             write_frame(self.stored("roughness"), {})
             return {}
         asked = asked_frames(len(self.source.sequence))
@@ -272,8 +328,37 @@ class MaterialWork:
             self.archive.keep(measured)
         frame.forget()
         if self.solves:
-            facts["counts"] = solve_frame(self.job, measured)
+            facts["counts"] = [solve_frame(self.job, measured)]
+        elif not self._solves_later:
+            facts["counts"] = [counts_of(measured, measured.cloud)]
         return facts | {key: getattr(measurement, key) for key in ("ray_count", "economy", "notes")}
+
+    def _solve_jointly(self) -> dict[str, Any]:
+        """Solve base colour over all frames; nothing where tracking was lost, so that they are not persistent."""
+        found, facts = None, {}
+        if self.are_persistent:
+            found, facts = solve_jointly(self.job, map(self.archive.read, range(len(self.frames.numbers()))))
+        write_frame(self.stored("joint"), {} if found is None else found.arrays())
+        return facts
+
+    def _solved_by(self, first: int) -> range:
+        """Return the places of the frames that are solved after all others, in the part that begins with one."""
+        places = range(first, min(first + PART, len(self.frames.numbers())))
+        if self._joint is None:
+            return places
+        return places[first == 0 :] if self._joint.is_varying else places[:0]
+
+    def _solve(self, places: Iterable[int]) -> dict[str, Any]:
+        """Write the solutions of some frames."""
+        counts = []
+        for place in places:
+            frame = self.archive.read(place)
+            if self._joint is None:
+                counts.append(solve_frame(self.job, frame))
+            else:
+                with self.source.log.timer("solve"):
+                    self.archive.keep_solution(place, self._joint.of_frame(frame))
+        return {"counts": counts}
 
     def _roughness(self, frame: SeenFrame, facts: dict[str, Any]) -> Mapping[str, NDArray[np.float32]]:
         """Return the roughness of a frame: stated, what all frames share, or its own, whose report joins the facts."""
@@ -286,14 +371,15 @@ class MaterialWork:
         facts["roughness"] = estimate.report
         return _roughness_arrays(estimate)
 
-    def measured(self) -> list[str]:
-        """Return the names of the steps that measure frames, in the order of the frames."""
-        return [material_step(number) for number in self.frames.numbers()]
-
 
 def material_step(number: int) -> str:
     """Return the name of the step that measures a frame."""
     return f"materials-{number:06d}"
+
+
+def solution_step(number: int) -> str:
+    """Return the name of the step that writes solutions from a frame on."""
+    return f"solution-{number:06d}"
 
 
 def _roughness_arrays(estimate: RoughnessEstimate) -> dict[str, NDArray[np.float32]]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.plan.steps import Plan
-from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process
+from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process, serve
 
 MOST_PROCESSES = 256
 """Processes of one machine, at most."""
@@ -14,13 +15,14 @@ MOST_PROCESSES = 256
 GPUS, RAY = "gpus", "ray"
 
 
-def crew_of(words: str, device: str | None) -> Crew:
+def crew_of(words: str, device: str | None, ahead: Sequence[str] = ()) -> Crew:
     """Return who does the work.
 
     Args:
         words: A number of processes; ``gpus`` for one on each GPU; ``ray`` for the Ray cluster that this machine is in;
             ``ray://HOST:PORT`` for one that is reached as a Ray client.
         device: The device that steps are told to use; None lets every worker have its own.
+        ahead: Modules that processes of this machine will need; they are imported while the caller goes on.
 
     Raises:
         InvalidOptionError: They mean nothing, or contradict the device.
@@ -33,13 +35,17 @@ def crew_of(words: str, device: str | None) -> Crew:
     if words == GPUS:
         if device is not None:
             raise InvalidOptionError(f"device must be left out with workers gpus, got {device}. Drop one of them.")
+        serve(ahead)
         return lambda plan, kind, progress: _processes(plan, kind, len(visible_gpus()), device)
     if not (words.isdecimal() and 1 <= int(words) <= MOST_PROCESSES):
         raise InvalidOptionError(
             f"workers must be a number from 1 to {MOST_PROCESSES}, gpus, ray or ray://HOST:PORT, got {words}. "
             "Write 4 for four processes."
         )
-    return in_process if int(words) == 1 else lambda plan, kind, _: _processes(plan, kind, int(words), device)
+    if int(words) == 1:
+        return in_process
+    serve(ahead)
+    return lambda plan, kind, progress: _processes(plan, kind, int(words), device)
 
 
 def visible_gpus() -> list[str]:

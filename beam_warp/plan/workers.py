@@ -1,7 +1,9 @@
 """Who does the steps of a plan: this process, or processes of this machine; for others see `beam_warp.plan.cluster`.
 
 All are driven in the same way: `Workers.start` gives one of them a task, `Workers.wait` returns what became of those
-that were given. A process that ends costs its task a try and is replaced.
+that were given. A process that ends costs its task a try and is replaced. Where the system can fork, one process, the
+server, imports what the work needs, and the others are forks of it, so that they, and those that replace them, start at
+once. The server never starts CUDA, which does not survive a fork.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import connection
+from multiprocessing import connection, forkserver
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,6 +31,15 @@ from beam_warp.plan.steps import Plan, Receipt, Task, Work, perform, worker_name
 
 OUTSIDE_SIGNALS = (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM))
 """Signals that come from outside; the others a process owes to what it does."""
+
+CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
+"""Whether there is a server that processes are forked from."""
+
+UNKNOWN_END = 255
+"""Exit code of a process that has outlived its server: nobody knows how it ended."""
+
+MOST_STARTS = 10
+"""Times that a process is started anew because its server was killed meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +220,13 @@ def wait_for_token(path: Path, patience: float = 5.0) -> None:
             time.sleep(0.1)
 
 
+def serve(modules: Sequence[str]) -> None:
+    """Start the server that processes are forked from, unless it runs; it imports modules while the caller goes on."""
+    if CAN_FORK and modules:
+        forkserver.set_forkserver_preload(list(modules))
+        forkserver.ensure_running()
+
+
 class Processes:
     """Processes of this machine, one for each entry of ``settings``; one that ends is replaced."""
 
@@ -225,8 +243,9 @@ class Processes:
         """
         self.count = len(settings)
         self._terms = terms
-        self._context = multiprocessing.get_context("spawn")
+        self._context = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
         self._packed = packed(works, terms)
+        serve(_modules_of(works))
         self._members = [self._member(setting) for setting in settings]
 
     def idle(self) -> list[str]:
@@ -252,7 +271,8 @@ class Processes:
         """Kill the process that does a step."""
         for member in self._members:
             if member.task is not None and member.task.step.name == name:
-                member.process.kill()
+                with suppress(ProcessLookupError):  # `Process.kill` takes who has outlived the server for ended
+                    os.kill(member.process.pid, OUTSIDE_SIGNALS[1])
 
     def now(self) -> float:
         """Return the time [s]."""
@@ -271,10 +291,15 @@ class Processes:
         """Return the numbers of the processes that live, for tests that kill some."""
         return [member.process.pid or 0 for member in self._members if member.process.is_alive()]
 
-    def _member(self, setting: Mapping[str, str]) -> _Member:
+    def _member(self, setting: Mapping[str, str], tries: int = MOST_STARTS) -> _Member:
         here, there = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(there, dict(setting)), daemon=True)
-        process.start()
+        process = self._context.Process(target=_serve, args=(there, {**os.environ, **setting}), daemon=True)
+        try:
+            process.start()
+        except (EOFError, OSError):  # the server was killed
+            if tries == 1:
+                raise
+            return self._member(setting, tries - 1)
         there.close()
         with suppress(OSError):
             here.send_bytes(self._packed)
@@ -300,13 +325,13 @@ class Processes:
         member.link.close()
         self._members[self._members.index(member)] = self._member(member.setting)
         code = member.process.exitcode or 0
-        if not member.is_ready and -code not in OUTSIDE_SIGNALS:
+        own = code != UNKNOWN_END and -code not in OUTSIDE_SIGNALS
+        if own and not member.is_ready:
             raise InvalidOptionError(
                 f"workers must start, got one that ended at once ({_ended(code)}). Try --workers 1 to see why."
             )
         if member.task is None:
             return []
-        own = -code not in OUTSIDE_SIGNALS
         return [Outcome(member.task.step.name, member.name, lost=_ended(code), is_own_fault=own)]
 
 
@@ -325,6 +350,12 @@ class _Member:
         return f"{worker_name().split(':')[0]}:{self.process.pid}"
 
 
+def _modules_of(works: Mapping[str, Work]) -> list[str]:
+    """Return the names of the modules that works, and what they hold, are defined in."""
+    held = [it for work in works.values() for it in (work, *vars(work).values())]
+    return sorted({type(it).__module__ for it in held} - {"__main__"})
+
+
 def _ended(code: int) -> str:
     """Return in words how a process ended, given its exit code."""
     if code < 0:
@@ -334,8 +365,9 @@ def _ended(code: int) -> str:
 
 
 def _serve(link: Any, setting: Mapping[str, str]) -> None:
-    """Do what the driver asks until it ends; the first message is the work, which is unpickled after the settings."""
+    """Do what the driver asks until it ends, in its environment; the first message is the work."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver hears it, and ends this process
+    os.environ.clear()
     os.environ.update(setting)
     tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
     content = link.recv_bytes()

@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -244,11 +244,10 @@ class ReconstructionWork:
 
     @cached_property
     def clips(self) -> ClipWork:
-        """Steps that write the asset of several segments; of one alone, the topology is known at the end."""
-        numbers = () if self.may_be_constant else tuple(self.frames.records)
-        return ClipWork(
-            self.folder, Path(ASSET_NAME).stem, self.sequence, [self.makers(number) for number in numbers], numbers
-        )
+        """Steps that write the asset; of one segment alone, the topology is known when all frames are made."""
+        numbers, read = tuple(self.frames.records), partial(self.sequence, is_constant=False)
+        makers, shared = list(map(self.makers, numbers)), frozenset({"ids"}) if self.may_be_constant else None
+        return ClipWork(self.folder, Path(ASSET_NAME).stem, read, makers, numbers, shared)
 
     def makers(self, frame: int) -> tuple[str, ...]:
         """Return the names of the steps that make the Gaussians of a frame."""
@@ -388,7 +387,7 @@ class ReconstructionWork:
         if is_seam:
             model.report["lost"] = lost or model.report["lost"]
             self.seams.write(step.frame, model)
-            return {}
+            return {"gaussians": 0 if model.report["lost"] else len(model.track.cloud)}
         self.store.write(step.frame, model)
         return {"line": frame_line(model.report), "report": model.report}
 
@@ -433,6 +432,13 @@ class ReconstructionWork:
         write_report(self.folder, report)
         return Reconstruction(self.folder / ASSET_NAME, sequence, report, self.seen())
 
+    def _frame_report(self, frame: int, receipts: Mapping[str, Receipt]) -> dict[str, Any]:
+        """Return what a frame's report says; Gaussians and seconds are those of both segments where one fades out."""
+        own, *seams = (receipts[name] for name in self.makers(frame))
+        report, fading = own.facts["report"], sum(seam.facts["gaussians"] for seam in seams)
+        seconds = own.seconds + sum(seam.seconds for seam in seams)
+        return {**report, "gaussians": report["gaussians"] + fading, "fading_gaussians": fading, "seconds": seconds}
+
     def _findings(self) -> list[Finding]:
         """Return what a user should know about the capture."""
         said = list(self.frames.findings)
@@ -447,7 +453,7 @@ class ReconstructionWork:
         """Return what was done and found, JSON-able."""
         records = self.records
         made = {frame: receipts[frame_step(frame)] for frame in records}
-        frames = [{**receipt.facts["report"], "seconds": receipt.seconds} for receipt in made.values()]
+        frames = [self._frame_report(frame, receipts) for frame in records]
         findings = self._findings()
         return {
             "input": {

@@ -56,8 +56,8 @@ def reconstruction_preview(
     Args:
         cloud: Gaussians with scene-linear radiance, axes "rfu".
         views: Photographs to compare with, of one size.
-        shadings: For each view a picture of the frame's mesh from there, ``(H, W, 3)`` 8-bit sRGB; none leaves the
-            column out.
+        shadings: For each view a picture of the frame's mesh from there, ``(H, W, 3)`` 8-bit sRGB, reduced as panels
+            are; none leaves the column out.
         options: How splats are drawn: as they were when the Gaussians were fitted.
         samples: Side of the square of samples of a pixel: as it was when the Gaussians were fitted.
         device: Warp device.
@@ -65,13 +65,15 @@ def reconstruction_preview(
     Returns:
         8-bit sRGB, ``(H, W, 3)``.
     """
-    cameras = [view.camera.supersampled(samples) for view in views]
+    factor = _reduction(views[0].camera, MOST_ROWS)
+    views, side = [view.reduced(factor) for view in views], samples * factor
+    cameras = [view.camera.supersampled(side) for view in views]
     buffers = rasterize(cloud, cameras, channels=(RADIANCE, SURFACE_NORMALS), options=options, device=device)
     panels: list[Panel] = []
     for index, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
-        alpha = block_means(buffer.alpha, samples)[..., None]
+        alpha = block_means(buffer.alpha, side)[..., None]
         radiance, normals = (
-            _straight(block_means(buffer.channels[name] * buffer.alpha[..., None], samples), alpha)
+            _straight(block_means(buffer.channels[name] * buffer.alpha[..., None], side), alpha)
             for name in (RADIANCE, SURFACE_NORMALS)
         )
         photograph = _shown(view)
@@ -87,7 +89,7 @@ def reconstruction_preview(
         ]
         if shadings:
             row.append(("mesh", shadings[index]))
-        panels += [(title, _fitted(pixels)) for title, pixels in row]
+        panels += [(title, _enlarged(pixels)) for title, pixels in row]
     return lay_out(panels, len(panels) // len(views))
 
 
@@ -101,6 +103,8 @@ def mesh_shadings(
 ) -> list[NDArray[np.uint8]]:
     """Return what some cameras see of the surface that all of them see of a cloud, ``(H, W, 3)`` 8-bit sRGB each.
 
+    Pictures have the size of panels.
+
     Args:
         cloud: Gaussians.
         cameras: Cameras that its depth is drawn for, with fewer pixels than a preview shows.
@@ -111,12 +115,18 @@ def mesh_shadings(
     Returns:
         A picture for each; none where there is no surface.
     """
-    smaller = [camera.reduced(min(-(-camera.height // FUSED_ROWS), camera.width)) for camera in cameras]
+    smaller = [camera.reduced(_reduction(camera, FUSED_ROWS)) for camera in cameras]
     try:
         mesh = mesh_of_gaussians(cloud, smaller, options=options, device=device)
     except InvalidArrayError:
         return []
-    return [shaded_image(mesh, cameras[index], device=device) for index in shown]
+    seeing = [cameras[index].reduced(_reduction(cameras[index], MOST_ROWS)) for index in shown]
+    return [shaded_image(mesh, camera, device=device) for camera in seeing]
+
+
+def _reduction(camera: Camera, most_rows: int) -> int:
+    """Return by which whole factor a view is reduced, so that so many rows are left at most."""
+    return min(-(-camera.height // most_rows), camera.width)
 
 
 def _shown(view: CapturedView) -> NDArray[np.uint8]:
@@ -131,12 +141,7 @@ def _straight(premultiplied: NDArray[np.floating], alpha: NDArray[np.floating]) 
     return np.divide(premultiplied, alpha, out=np.zeros_like(premultiplied), where=alpha > 0.0)
 
 
-def _fitted(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Reduce or enlarge a panel by a whole factor."""
-    rows, columns = pixels.shape[:2]
-    factor = -(-rows // MOST_ROWS)
-    if factor > 1:
-        kept = pixels[: rows // factor * factor, : columns // factor * factor]
-        return np.rint(block_means(kept, factor)).astype(np.uint8)
-    factor = max(-(-FEWEST_ROWS // rows), 1)
+def _enlarged(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Enlarge a small panel by a whole factor."""
+    factor = max(-(-FEWEST_ROWS // len(pixels)), 1)
     return np.repeat(np.repeat(pixels, factor, axis=0), factor, axis=1)

@@ -1,17 +1,19 @@
 """Long assets whose clips are steps of a plan: the bytes of a sequence that is written at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.radiant_cloud import radiant_cloud
 
 from beam_warp import converters
+from beam_warp.converters import usd
 from beam_warp.converters.clips import ClipWork
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.outputs import replacing
 from beam_warp.plan.carry import carry_out
-from beam_warp.plan.steps import Plan, Step
+from beam_warp.plan.steps import Plan, Step, version_of
 from beam_warp.plan.workers import InProcess
 from beam_warp.schema.clips import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER
 from beam_warp.world.gaussians import GaussianSequence
@@ -24,7 +26,7 @@ class Made:
     """Steps that make frames: of each, only that it was made."""
 
     folder: Path
-    is_still: bool
+    kind: str
 
     def common(self):
         return ""
@@ -41,27 +43,45 @@ class Made:
         return {}
 
     def frame(self, number):
-        """A frame: in some, values are too small for half, or there are more Gaussians, or higher bands."""
+        """A frame: in some, values are too small for half, or there are more Gaussians, or higher bands.
+
+        Of the same Gaussians, quaternions leap at random, and roughness is said to be that of the first frame.
+        """
         assert (self.folder / f"frame-{number}.txt").exists()
-        if self.is_still:
+        if self.kind == "still":
             return radiant_cloud(5, degree=0)
+        if self.kind in ("same", "found"):
+            return radiant_cloud(40, degree=0, materials=True, seed=number, axes="rfu", ids=np.arange(40))
         cloud = radiant_cloud(5 + number % 3, degree=1 + (number == 40), materials=True, seed=number, axes="rfu")
         scales = cloud.scales.copy()
         scales[0] = 1e-6 if number == 70 else 0.1
         return cloud.with_arrays(scales=scales)
 
     def sequence(self):
-        return GaussianSequence(COUNT, self.frame, 25.0, frozenset(), "perFrame", {"normal_source": "shortestAxis"})
+        """The frames as steps see them: of some, that they are the same Gaussians is found out."""
+        stated = {"constant": frozenset({"ids"}), "topology": "constant"} if self.kind == "same" else {}
+        return GaussianSequence(COUNT, self.frame, 25.0, **stated, metadata={"normal_source": "shortestAxis"})
+
+    def whole(self):
+        """The frames when all are made."""
+        if self.kind not in ("same", "found"):
+            return self.sequence()
+        return replace(self.sequence(), constant=frozenset({"ids", "roughness"}), topology="constant")
 
 
-def written(folder, is_still):
+def work(folder, kind):
     folder.mkdir()
-    made = Made(folder, is_still)
+    made, names = Made(folder, kind), [(f"frame-{number}",) for number in range(COUNT)]
+    shared = {"same": {"roughness"}, "found": {"roughness"}, "lost": {"roughness"}}.get(kind)
+    return made, ClipWork(folder, "asset", made.sequence, names, range(COUNT), shared and frozenset(shared))
+
+
+def written(folder, kind):
+    made, clips = work(folder, kind)
     steps = [Step(f"frame-{number}", "frame", number) for number in range(COUNT)]
-    clips = ClipWork(folder, "asset", made.sequence, [(step.name,) for step in steps], range(COUNT))
     plan = Plan(folder, tuple(steps), {"frame": made}).with_steps_of(clips.plan())
     receipts = carry_out(plan, here(plan))
-    clips.write(made.sequence(), folder / "asset.usda", receipts)
+    clips.write(made.whole(), folder / "asset.usda", receipts)
     return made, receipts, plan
 
 
@@ -73,17 +93,17 @@ def here(plan):
     return InProcess(plan.works, no_progress)
 
 
-@pytest.mark.parametrize("is_still", [False, True])
-def test_clips_of_steps_have_the_bytes_of_one_call(tmp_path, is_still):
-    made, _, plan = written(tmp_path / "steps", is_still)
-    converters.write(made.sequence(), tmp_path / "asset.usda")
+@pytest.mark.parametrize("kind", ["varying", "still", "same", "found", "lost"])
+def test_clips_of_steps_have_the_bytes_of_one_call(tmp_path, kind):
+    made, _, plan = written(tmp_path / "steps", kind)
+    converters.write(made.whole(), tmp_path / "asset.usda")
     assert layers(tmp_path / "steps") == layers(tmp_path)
-    assert len(layers(tmp_path)) == (2 if is_still else 6)
+    assert len(layers(tmp_path)) == (2 if kind == "still" else 6)
     assert all(receipt.is_kept for receipt in carry_out(plan, here(plan)).values())
 
 
 def test_a_lost_clip_is_written_again_and_nothing_else(tmp_path):
-    _, before, plan = written(tmp_path / "out", False)
+    _, before, plan = written(tmp_path / "out", "same")
     clip = tmp_path / "out" / "clips" / "asset.000030.usdc"
     content = clip.read_bytes()
     clip.unlink()
@@ -92,3 +112,9 @@ def test_a_lost_clip_is_written_again_and_nothing_else(tmp_path):
     assert clip.read_bytes() == content
     assert (tmp_path / "out" / clip.name).read_bytes() == content
     assert before.keys() > again
+
+
+def test_who_hands_steps_out_loads_no_usd(tmp_path, monkeypatch):
+    monkeypatch.setattr(usd, "prepared", None)
+    _, clips = work(tmp_path / "out", "varying")
+    assert version_of(clips.plan().works["asset-clip"])

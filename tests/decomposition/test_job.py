@@ -105,7 +105,7 @@ def test_a_relighting_says_which_light_it_shows(tmp_path, light, monkeypatch, st
         titles.extend(shown.title for shown in lights)
         return np.zeros((8, 8, 3), np.uint8)
 
-    monkeypatch.setattr("beam_warp.decomposition.result.contact_sheet", sheet)
+    monkeypatch.setattr("beam_warp.render.sheet.contact_sheet", sheet)
     job(frames(0.0), light, tmp_path / "out", replace(FAST, exposure=stops))
     assert titles == [title, "relit by that light turned by 180°"]
 
@@ -188,6 +188,25 @@ def test_persistent_frames_share_one_base_colour(tmp_path, light, whole):
     separate = job(frames(0.0, 0.1, ids=False), light, tmp_path / "out").sequence
     assert separate.topology == "perFrame"
     assert "base_color" not in separate.constant
+
+
+def test_colours_that_change_have_solutions_of_their_own(tmp_path, light, monkeypatch):
+    """A tenth of the Gaussians blink; solutions are the same however many frames a step solves."""
+    blinks, found = np.arange(200) < 20, {}
+    clouds = [
+        frame().with_arrays(radiance=np.where(blinks, 0.9 * (-1) ** number - 0.3, 0.3)[:, None, None] * np.ones((1, 3)))
+        for number in range(5)
+    ]
+    for part in (2, 30):
+        monkeypatch.setattr("beam_warp.decomposition.work.PART", part)
+        found[part] = job(GaussianSequence.from_clouds(clouds), light, tmp_path / str(part))
+    sequence, report = found[2].sequence, found[2].report
+    assert report["materials"]["changing_part"] == pytest.approx(0.1)
+    assert "base_color" not in sequence.constant
+    change = np.abs(sequence[1].base_color - sequence[0].base_color).max(axis=1)
+    assert (change[blinks] > 0.1).all()
+    assert (change[~blinks] == 0.0).all()
+    assert folder_bytes(tmp_path / "2") == folder_bytes(tmp_path / "30")
 
 
 def test_the_image_path_needs_images(tmp_path, light):
@@ -448,7 +467,7 @@ class TestWithACapture:
             traced.append(found.ray_count)
             return found
 
-        monkeypatch.setattr("beam_warp.decomposition.measure.decompose_by_images", counted)
+        monkeypatch.setattr("beam_warp.materials.images.decompose_by_images", counted)
         darker = discs[0].with_arrays(opacities=discs[0].opacities * np.float32(0.5))
         changed = GaussianSequence.from_clouds([darker, discs[1]], metadata=discs.metadata)
         for sequence, resumed in ((discs, 0), (discs, 2), (changed, 0)):

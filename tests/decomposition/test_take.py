@@ -4,11 +4,12 @@ import os
 import signal
 import threading
 import time
+from pathlib import Path
 
 import pytest
 from support.fake_steps import FakeSteps, write_capture
 
-from beam_warp import RunOptions, validate
+from beam_warp import RunOptions, converters, validate
 from beam_warp.capture.capture import Capture
 from beam_warp.decomposition.frames import ReconstructedFrames
 from beam_warp.decomposition.job import OverviewOptions, run_capture
@@ -60,14 +61,22 @@ def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
 
 
 @pytest.mark.slow
-def test_processes_write_the_same_clips(tmp_path):
-    """Both assets of a take that is long enough to have clips, which are steps."""
-    capture = Capture.read(write_capture(tmp_path / "capture", range(64)))
-    take(capture, tmp_path / "one", FakeSteps(), 16)
-    two = take(capture, tmp_path / "two", FakeSteps(), 16, crew_of("2", "cpu"))
+@pytest.mark.parametrize(("length", "lost"), [(16, False), (0, False), (0, True)])
+def test_processes_write_the_same_clips(tmp_path, length, lost):
+    """Both assets of a take that is long enough to have clips, which are steps; these find whether it is persistent."""
+    dim = {frame: 0.2 + 0.002 * frame for frame in range(64)}
+    capture = Capture.read(write_capture(tmp_path / "capture", range(64), levels=dim | ({40: 0.95} if lost else {})))
+    take(capture, tmp_path / "one", FakeSteps(), length)
+    two = take(capture, tmp_path / "two", FakeSteps(), length, crew_of("2", "cpu"))
+    assert two.result.sequence.topology == ("constant" if length == 0 and not lost else "perFrame")
     assert validate(two.result.asset).is_valid
     assert look(tmp_path / "two").stages["asset-clip"].done == look(tmp_path / "two").stages["gaussians-clip"].done == 3
     assert results(tmp_path / "one") == results(tmp_path / "two")
+    for name, found in (("asset", two.result.sequence), ("reconstruction/gaussians", two.reconstruction.sequence)):
+        serial = tmp_path / Path(name).name
+        converters.write(found, serial.with_suffix(".usda"))
+        for clip in tmp_path.glob(f"{serial.name}.*"):
+            assert clip.read_bytes() == (tmp_path / "two" / f"{name}{clip.name.removeprefix(serial.name)}").read_bytes()
     assert (tmp_path / "two" / "asset.000030.usdc").samefile(tmp_path / "two" / "clips" / "asset.000030.usdc")
 
 

@@ -1,5 +1,6 @@
 """Plans of steps that cost nothing: order, faults, kills, and the same bytes whoever does the work."""
 
+import multiprocessing
 import os
 import random
 import signal
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from support.storm_takes import processes_of
 from support.toy_work import toy_plan
 
 from beam_warp.errors import InvalidOptionError, OutputError, UnfinishedError
@@ -255,6 +257,27 @@ class TestProcesses:
         for said, count in (("SIGKILL", 1), ("exit code 3", 3), ("took more than", 3), ("poisoned", 2)):
             assert sum(said in error for error in heard) == count, said
 
+    @pytest.mark.skipif(sys.platform == "win32", reason="processes are not forked")
+    @pytest.mark.parametrize(("fault", "says"), [("kill once", "exit code 255"), ("hang once", "took more than")])
+    def test_a_process_outlives_the_one_it_was_forked_from(self, tmp_path, whole, fault, says):
+        plan, heard = toy_plan(tmp_path, faults={"frame-2": fault}), []
+        workers = processes(plan, 1)
+        (worker,) = map(psutil.Process, workers.processes())
+        server = worker.parent()
+        assert server != psutil.Process()
+
+        def harm(step, receipt, error):
+            heard.append(error)
+            if step.name == "frame-1":
+                server.kill()
+                while server.status() != psutil.STATUS_ZOMBIE:
+                    time.sleep(0.01)
+                assert not multiprocessing.active_children()  # as far as anybody can tell
+
+        carry_out(plan, workers, harm, Patience(1.0, 1.0, 1.0))
+        assert outputs(tmp_path) == whole
+        assert [error for error in heard if error] == [next(error for error in heard if says in error)]
+
     def test_work_that_cannot_be_sent(self, tmp_path):
         plan = toy_plan(tmp_path, 1, faults={"frame-0": lambda: None})
         with pytest.raises(InvalidOptionError, match="work must be picklable"):
@@ -300,7 +323,7 @@ def begun(folder):
 def kill_one(driver, rng):
     """Kill a driver, or twice as likely one of its workers; return how many were there to be killed."""
     with suppress(psutil.NoSuchProcess):
-        workers = [it for it in psutil.Process(driver).children() if "spawn_main" in str(it.cmdline())]
+        workers = processes_of(driver)
         rng.choice([psutil.Process(driver), *workers, *workers]).kill()
         return 1
     return 0
@@ -318,7 +341,9 @@ def storm(folder, kills, workers, seed):
             arguments = [sys.executable, "-P", str(script), str(out), str(workers)]
             driver = subprocess.Popen(arguments, env={**os.environ, "PYTHONPATH": paths})
             while (code := driver.poll()) is None:
-                if (count := begun(out)) > seen:  # else nobody has begun anything that a kill could spoil
+                if (
+                    killed < kills and (count := begun(out)) > seen
+                ):  # else nobody has begun anything that a kill could spoil
                     seen = count
                     time.sleep(rng.uniform(0.0, 0.06))
                     killed += kill_one(driver.pid, rng)
