@@ -70,8 +70,13 @@ def test_neither_import_nor_records_cost_warp_or_usd():
 
 
 def test_steps_of_a_take_start_without_what_they_do_not_need():
-    """Renderers draw the overview at the end, OpenUSD writes clips, and the image path is an option."""
-    script = f"import sys, importlib\nfor name in {STEP_MODULES}: importlib.import_module(name)\nprint(*sys.modules)"
+    """Renderers draw the overview at the end, OpenUSD writes clips, and the image path is an option.
+
+    Warp's own code stays unloaded: processes are forked from one that has imported these, and CUDA survives no fork.
+    """
+    started = "from warp._src.context import runtime\nassert runtime is None, runtime"
+    script = f"import sys, importlib\nfor name in {STEP_MODULES}: importlib.import_module(name)\n{started}\n"
+    script += "print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
     loaded = set(done.stdout.split())
     assert set(STEP_MODULES) <= loaded
