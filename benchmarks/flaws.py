@@ -80,6 +80,7 @@ NAMED: Mapping[str, Collection[str]] = {
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[tuple[str, str, float, int]]:
+    "blots": ("mask-blots",),
     """Yield the cases that are asked for: capture, name of the flaw, size and seed."""
     for capture, seed, size, name in product(arguments.captures, arguments.seeds, arguments.sizes, arguments.flaws):
         if name not in SIZELESS or size == arguments.sizes[0]:
