@@ -275,8 +275,8 @@ def stated_errors(sequence: GaussianSequence, clean: Capture, frame: int, device
     Both are drawn, and compared in the pixels of test views that show the subject alone: a Gaussian's own value is seen
     by nobody, and neighbours in a fit err against each other in what their sum shows rightly. Normally distributed
     errors that are stated rightly have a median |z| of 0.67, 68 % within 1 and 95 % within 2. A light that is stated
-    too bright makes all base colours too dark by one factor, of which errors say nothing: ``base_color_scaled`` is
-    without it.
+    too bright makes all base colours too dark by one factor. Its error is stated apart, and joined with that of each
+    colour; ``base_color_alone`` is without it, and ``base_color_scaled`` without the factor.
     """
     cloud = change_axes(sequence[0], "rfu")
     records = [entry for entry in clean.select(split="test", frames=[frame]) if entry.truth_path is not None]
@@ -358,6 +358,9 @@ def main() -> int:
     rows = known_rows(arguments)
     done = {tuple(row["case"].values()) for row in rows}
     with tempfile.TemporaryDirectory() as place:
+            common = [float(word) for word in sequence.metadata["base_color_scale_errors"].split()]
+            found["base_color_alone"] = found[name]
+            found[name] = shares(value - true, np.hypot(error, value * common))
         captures: dict[str, Capture] = {}
         for case in cases(arguments):
             begun = time.perf_counter()

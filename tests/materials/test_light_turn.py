@@ -237,4 +237,6 @@ def test_how_far_base_colors_are_known_is_said():
     assert (turned.code, turned.severity) == ("environment-turned", "warning")
     assert (scale.code, scale.severity) == ("base-color-scale", "note")
     assert "0.2 to 0.9 times as bright" in str(scale)
+    assert "standard error" not in str(scale)
+    assert "10 % is one standard error" in str(replace(known, scale_errors=(0.1, 0.09, 0.11)).findings[1])
     assert replace(known, turn=LightTurn(), scales=(float("nan"), float("nan"))).findings == []
