@@ -397,6 +397,15 @@ MATERIALS = (
             ("WORST_ERROR", "Standard error from which silhouettes are asked [pixel]."),
             ("POOR", "Quality below which silhouettes are asked [dB]."),
             ("UNMET", "Quality below which photographs are not of one subject [dB]."),
+            ("UNEXPLAINED", "Part of a photograph's colours that others explain, below which they are not either."),
+        )
+    ),
+    *(
+        Constant(f"beam_warp.reconstruction.labels:{name}", "walker, runner, robot, balls", does, EXACT_RIGS)
+        for name, does in (
+            ("ALIKE", "Explained part from which on another camera may have taken a photograph."),
+            ("FAR_BETTER", "How much less that leaves unexplained."),
+            ("LEAST_CONTRAST", "Contrast of colours that tell."),
         )
     ),
     *(
@@ -556,6 +565,7 @@ UNTUNED = {
         beam_warp.reconstruction.hull: DISTANCE_LIMIT
         beam_warp.reconstruction.rig: FEWEST_CAMERAS FEWER_POINTS FEWEST_GAUSSIANS MOST_GAUSSIANS
         beam_warp.reconstruction.rig: SHORTEST_SIDE
+        beam_warp.reconstruction.labels: MOST_POINTS FEWEST_POINTS SOLID
         beam_warp.reconstruction.alignment: ENCODED_KNEE NUMBERS
         beam_warp.reconstruction.stereo: LEVELS SMALLEST_SIDE LEAST_PIXELS
         beam_warp.reconstruction.unmasked: PIXELS

@@ -1,13 +1,17 @@
 """What do the flaws of real captures cost, and are they told? The product's own job on flawed copies of clean captures.
 
     python benchmarks/flaws.py --out JSON [--device cuda:0] [--captures NAME ...] [--flaws NAME ...] [--sizes S ...]
-        [--seeds N ...] [--preset draft] [--gaussians 8000] [--frames 1] [--seconds 540]
+        [--seeds N ...] [--preset draft] [--gaussians 8000] [--frames 1] [--seconds 540] [--naming all]
+        [--reduction 2]
 
 A case is a capture with a flaw (`beam_warp.stability.flaws`), of a size over the nominal one, drawn by a seed, which is
 the job's seed too. ``clean`` is without any, ``flawed`` with all that a good studio gets a little wrong, and ``a+b``
 with several. `beam run` makes an asset of the first frames whose truth is known, and `beam evaluate` scores it against
 the clean capture: its test images, poses and materials. Results are written after each case; cases that the file holds
 already are not run again, if the code is the same. With ``--seconds``, no case is begun that would not end by then.
+
+With ``--naming``, a case ends with what is said of it: of images, of the rig too, or of all but the materials;
+nothing is scored. Flaws are measured in pixels, so that captures may be reduced by ``--reduction``, as a CPU must.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -30,12 +34,18 @@ from numpy.typing import NDArray
 from parts import Row
 
 from beam_warp import converters
-from beam_warp.capture.capture import Capture
+from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.corrections import RigCorrection, move_between
 from beam_warp.capture.findings import Finding
-from beam_warp.cli.reconstruct import Modelling
+from beam_warp.capture.inspect import require_reconstructable
+from beam_warp.capture.views import CapturedView
+from beam_warp.cli.decompose import Measuring, run_options
+from beam_warp.cli.reconstruct import Modelling, options_of, steps_of
 from beam_warp.cli.run import Run
 from beam_warp.cli.run import run as run_job
+from beam_warp.decomposition.capture_light import find_light
+from beam_warp.decomposition.frames import GivenFrames
+from beam_warp.decomposition.work import MaterialWork
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.demo.lights import sunset
 from beam_warp.device.arrays import resolve_device
@@ -44,12 +54,15 @@ from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
+from beam_warp.reconstruction.job import reconstruct
 from beam_warp.reconstruction.rig import in_gauge, pixels_of
 from beam_warp.reconstruction.scores import truth_frames
+from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.stability.capture_cases.case import Detection, detections_of, in_words
 from beam_warp.stability.flaws.write import FLAWS, STUDIO, FlawedCapture, write_flawed
 from beam_warp.world.axes import change_axes
 from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
@@ -67,12 +80,14 @@ NAMED: Mapping[str, Collection[str]] = {
     "noise": ("noisy-images",),
     "masks": ("mask-offset",),
     "cutouts": ("mask-offset",),
+    "blots": ("mask-blots",),
     "light": ("environment-turned", "environment-exposure"),
     "clipping": ("clipped-images",),
     "defocus": ("soft-images",),
     "motion-blur": ("motion-blur",),
     "jpeg": ("jpeg-loss",),
     "poses": ("camera-poses",),
+    "distortion": ("lens-distortion", "camera-poses"),
     "wrong-camera": ("sees-nothing", "camera-contradicts"),
     "missing-image": ("missing-image",),
 }
@@ -98,22 +113,22 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     copy = write_flawed(clean, folder / "capture", flaws_of(name), size=size, seed=seed, frames=frames)
     written = time.perf_counter()
     out = folder / "out"
-    asked = Run(
-        input=copy.capture.folder,
-        out=out,
-        modelling=Modelling(gaussians=arguments.gaussians, preset=arguments.preset),
-        seed=seed,
-        device=arguments.device,
-        quiet=True,
-    )
+    modelling = Modelling(gaussians=arguments.gaussians, preset=arguments.preset)
+    asked = Run(input=copy.capture.folder, out=out, modelling=modelling, seed=seed, device=arguments.device, quiet=True)
     row: Row = {"injected": copy.injected, "seconds": {"write": written - started}}
+    findings: list[Finding] = []
     try:
-        run_job(asked)
+        if arguments.naming:
+            findings = findings_of(asked, arguments.naming)
+        else:
+            run_job(asked)
     except BeamError as error:
         said = str(error).replace(f"{folder}{os.sep}", "")
         row["seconds"]["run"] = time.perf_counter() - written
         return {**row, "refused": said, **told(copy, name, [Finding("error", "refused", said)])}
     row["seconds"]["run"] = time.perf_counter() - written
+    if arguments.naming:
+        return row | told(copy, name, findings)
     reconstruction, decomposition = (
         json.loads((place / "report.json").read_text()) for place in (out / "reconstruction", out)
     )
@@ -132,6 +147,49 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     row["errors"] = stated_errors(sequence, clean, frames[0], arguments.device)
     row["seconds"]["evaluate"] = time.perf_counter() - evaluated
     return row
+
+
+def findings_of(asked: Run, what: str) -> list[Finding]:
+    """Return what the job says of a capture: of its images, of its rig too, or of Gaussians and light too."""
+    capture = Capture.read(asked.input)
+    if what == "images":
+        return list(require_reconstructable(capture).fallbacks)
+    assert capture.environment_path is not None
+    light = EnvironmentMap.read(capture.environment_path)
+    steps = steps_of(asked.modelling, capture, asked.seed, asked.device, light)
+    assert isinstance(steps, FitAndTrack)
+    if what == "rig":
+        steps = replace(steps, fitting=replace(steps.fitting, color_iterations=1, normal_iterations=0))
+    found = reconstruct(capture, asked.out, steps, options_of(asked.modelling, capture))
+    said = found.report["findings"] + [finding for frame in found.report["frames"] for finding in frame["findings"]]
+    if what == "all":
+        options = run_options(
+            Measuring(), capture, preset="direct", seed=asked.seed, device=asked.device, persistent=False
+        )
+        work = MaterialWork(asked.out, GivenFrames(lambda: found.sequence, found.capture), light, options)
+        said += json.loads(find_light(light, work.source)["findings"].tobytes())
+    return [Finding(**finding) for finding in said]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReducedRecord(CaptureRecord):
+    """A record at a lower resolution than its file's."""
+
+    whole: CaptureRecord
+    reduction: int
+
+    def view(self) -> CapturedView:
+        """Read the view and reduce it."""
+        return self.whole.view().reduced(self.reduction)
+
+
+def reduced(capture: Capture, reduction: int) -> Capture:
+    """Return a capture at a lower resolution."""
+    records = (
+        ReducedRecord(**{**vars(record), "camera": record.camera.reduced(reduction)}, whole=record, reduction=reduction)
+        for record in capture.records
+    )
+    return replace(capture, records=tuple(records))
 
 
 def told(copy: FlawedCapture, name: str, findings: Collection[Finding]) -> Row:
@@ -274,8 +332,8 @@ def stated_errors(sequence: GaussianSequence, clean: Capture, frame: int, device
     Both are drawn, and compared in the pixels of test views that show the subject alone: a Gaussian's own value is seen
     by nobody, and neighbours in a fit err against each other in what their sum shows rightly. Normally distributed
     errors that are stated rightly have a median |z| of 0.67, 68 % within 1 and 95 % within 2. A light that is stated
-    too bright makes all base colours too dark by one factor, of which errors say nothing: ``base_color_scaled`` is
-    without it.
+    too bright makes all base colours too dark by one factor. Its error is stated apart, and joined with that of each
+    colour; ``base_color_alone`` is without it, and ``base_color_scaled`` without the factor.
     """
     cloud = change_axes(sequence[0], "rfu")
     records = [entry for entry in clean.select(split="test", frames=[frame]) if entry.truth_path is not None]
@@ -300,6 +358,9 @@ def stated_errors(sequence: GaussianSequence, clean: Capture, frame: int, device
         )
         found[name] = shares(value - true, error)
         if name == "base_color":
+            common = [float(word) for word in sequence.metadata["base_color_scale_errors"].split()]
+            found["base_color_alone"] = found[name]
+            found[name] = shares(value - true, np.hypot(error, value * common))
             scale = (value * true).sum(axis=0) / (value**2).sum(axis=0)
             found["base_color_scaled"] = shares(scale * value - true, scale * error)
     return found
@@ -349,6 +410,8 @@ def main() -> int:
     parser.add_argument("--gaussians", type=int, metavar="N", help="by default the preset's")
     parser.add_argument("--frames", type=int, default=1, metavar="N", help="with truth, from the first on")
     parser.add_argument("--seconds", type=float, help="begin no case that would end later")
+    parser.add_argument("--naming", choices=("images", "rig", "all"), help="stop at what is said of these")
+    parser.add_argument("--reduction", type=int, default=1, metavar="K", help="of images, with --naming")
     arguments = parser.parse_args()
     for name in arguments.flaws:
         if unknown := set(flaws_of(name)) - set(FLAWS):
@@ -364,7 +427,8 @@ def main() -> int:
                 continue
             capture, name, size, seed = case
             if capture not in captures:
-                captures[capture] = capture_of(capture, arguments.data, Path(place), arguments.device)
+                whole = capture_of(capture, arguments.data, Path(place), arguments.device)
+                captures[capture] = reduced(whole, arguments.reduction)
             with tempfile.TemporaryDirectory(dir=place) as folder:
                 row = measure(captures[capture], name, size, seed, arguments, Path(folder))
             title = f"{capture} {name}" + ("" if name in SIZELESS else f" x{size:g}") + f" seed {seed}"
@@ -381,10 +445,13 @@ def in_a_line(row: Row) -> str:
     """Return a row for people who wait."""
     if "refused" in row:
         return f"refused: {row['refused']}"
+    said = f"said {', '.join(row['said']) or 'nothing'}"
+    if "scores" not in row:
+        return said
     found = row["scores"]
     keys = ("ambient_occlusion", "base_color_scaled", "relit_scaled", "novel_view")
     psnr = ", ".join(f"{key} {found[key]['psnr']:.1f}" for key in keys if key in found)
-    return f"{psnr}, normals {found['normals_median_degrees']:.1f}°; said {', '.join(row['said']) or 'nothing'}"
+    return f"{psnr}, normals {found['normals_median_degrees']:.1f}°; {said}"
 
 
 if __name__ == "__main__":

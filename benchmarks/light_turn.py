@@ -48,23 +48,11 @@ def evidence_of(capture: Capture, device: str) -> LightEvidence:
     return light_evidence(scene, SurfacePoints.seen_by(cloud, seen, scene), seen, ASKED)
 
 
-def some(evidence: LightEvidence, rows: slice) -> LightEvidence:
-    """Return some of the points."""
-    return LightEvidence(
-        positions=evidence.positions[rows],
-        normals=evidence.normals[rows],
-        openness=evidence.openness[rows],
-        colors=evidence.colors[:, rows],
-        weights=evidence.weights[:, rows],
-        directions=evidence.directions[:, rows],
-    )
-
-
 def turns(evidence: LightEvidence, light: EnvironmentMap) -> list[dict[str, Any]]:
     """Return what is found of every stated turn, in both halves of the points."""
     found = []
     for half in (0, 1):
-        asked = some(evidence, slice(half, None, 2))
+        asked = evidence.some(slice(half, None, 2))
         for stated in TURNS:
             turn = find_turn(asked, light.rotated(stated))
             said = {"error": turn.degrees + stated, "standard_error": turn.standard_error}
@@ -105,7 +93,7 @@ def of_other_places(
 
 def highlight_scales(evidence: LightEvidence, light: EnvironmentMap) -> dict[str, dict[str, float]]:
     """Return how bright highlights are over those expected of each roughness, with the jackknife's standard error."""
-    shown = light_fits.well_shown(some(evidence, slice(0, None, 2)))
+    shown = light_fits.well_shown(evidence.some(slice(0, None, 2)))
     lights, parts = light_fits.turned_lights(light)[:1], light_fits.parts_of(shown.positions)
     found = {}
     for roughness in ROUGHNESSES:
@@ -134,7 +122,7 @@ def main() -> None:
             "turns": turns(evidence, light),
             "highlights": highlight_scales(evidence, light),
             "possible_scales": possible_scales(evidence, light),
-            "places": of_other_places(some(evidence, slice(0, None, 2)), light, others),
+            "places": of_other_places(evidence.some(slice(0, None, 2)), light, others),
         }
         print(name, rows[name], flush=True)
     record.write_result(given, device, {"captures": rows})

@@ -57,6 +57,27 @@ def recovered(result: Row) -> Rows:
     return [head, *(_recovered(label, rows) for label, rows in _groups(result))]
 
 
+@table("flaws_named", "flaws_named_cpu.json")
+def named(result: Row) -> Rows:
+    """Return what is said of each flaw, and in how many runs, of each capture."""
+    captures = list(dict.fromkeys(row["case"]["capture"] for row in result["rows"]))
+    by_flaw: dict[tuple[str, float], dict[str, list[Row]]] = {}
+    for row in result["rows"]:
+        case = row["case"]
+        by_flaw.setdefault((case["flaw"], case["size"]), {}).setdefault(case["capture"], []).append(row)
+    body = [
+        [_words(*key), *(_named(rows[name]) or "nothing" if name in rows else "" for name in captures)]
+        for key, rows in by_flaw.items()
+    ]
+    return [["what is wrong", *captures], *body]
+
+
+def _words(flaw: str, size: float) -> str:
+    """Return what is wrong, in words."""
+    words = WORDS.get(flaw) or "; ".join(FLAWS[part] for part in flaw.split("+"))
+    return ", ".join(filter(None, (words, TIMES.get(size, f"times {size:g}"))))
+
+
 def _groups(result: Row) -> Iterator[tuple[str, list[Row]]]:
     """Yield the runs of each flaw under its words, in the order of the tables."""
     groups: dict[Key, list[Row]] = {}
@@ -66,9 +87,7 @@ def _groups(result: Row) -> Iterator[tuple[str, list[Row]]]:
     captures = list(dict.fromkeys(capture for capture, *_ in groups))
     for key in sorted(groups, key=lambda key: (captures.index(key[0]), key[1] != "clean", _quality(groups[key]))):
         capture, name, size = key
-        words = WORDS.get(name) or "; ".join(FLAWS[part] for part in name.split("+"))
-        parts = [capture if len(captures) > 1 else "", words, TIMES.get(size, f"times {size:g}")]
-        yield ", ".join(filter(None, parts)), groups[key]
+        yield ", ".join(filter(None, (capture if len(captures) > 1 else "", _words(name, size)))), groups[key]
 
 
 def _recovered(label: str, rows: Sequence[Row]) -> list[str]:

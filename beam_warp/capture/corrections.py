@@ -84,6 +84,8 @@ class RigCorrection(SideFile):
         kinds: Kinds of numbers that were moved: turn, focal, shift, center.
         world: The motion of the world that was taken out of the corrections, because no photograph tells it: turn
             [rad], shift [m] and the logarithm of scale, about the subject's middle, ``(7,)``.
+        distortion: How far lenses move the subject in images beyond what is stated, root mean square [pixel], which
+            nothing undoes; 0 where that is no more than chance.
     """
 
     FILE = "cameras.json"
@@ -94,6 +96,7 @@ class RigCorrection(SideFile):
     confidence: float
     kinds: tuple[str, ...] = ()
     world: tuple[float, ...] = (0.0,) * 7
+    distortion: float = 0.0
 
     def ways(self, cameras: Mapping[str, Camera], point: ArrayLike) -> dict[str, NDArray[np.float64]]:
         """Return which way corrections move a point in the images of cameras that were moved [pixel], ``(2,)`` each.
@@ -149,6 +152,12 @@ class RigCorrection(SideFile):
                     "Calibrate the rig again.",
                 )
             )
+        if self.distortion > 0.0:
+            what = (
+                f"photographs show the subject {self.distortion:.2f} pixels from where pinholes do, as lenses that "
+                "nobody states distort, and are taken as they are"
+            )
+            found.append(Finding("warning", "lens-distortion", what, "", "State the lenses, or undistort the images."))
         left_out = [camera.camera for camera in self.cameras if not camera.is_used]
         if left_out:
             found.append(
@@ -172,6 +181,7 @@ class RigCorrection(SideFile):
             "error": self.error,
             "kinds": list(self.kinds),
             "world": list(self.world),
+            "distortion": self.distortion,
             "cameras": [asdict(camera) for camera in self.cameras],
         }
 
@@ -186,6 +196,7 @@ class RigCorrection(SideFile):
             require_number("confidence", content["confidence"], 0.0),
             tuple(str(kind) for kind in content.get("kinds", ())),
             tuple(world.tolist()),
+            require_number("distortion", content.get("distortion", 0.0), 0.0),
         )
 
 

@@ -101,6 +101,28 @@ class RigExposures(SideFile):
         return cls(cameras, **errors, **{name: bool(content[name]) for name in ("exposure_undone", "balance_undone")})
 
 
+def scale_errors(gains: ArrayLike) -> tuple[float, float, float]:
+    """Return by how much light and images may differ in brightness, where the images of a rig were matched to its mean.
+
+    The light was measured by one more camera, which nothing compares with the rig. It is taken to be off as the others
+    are: of V gains whose logarithms have a standard deviation s, a further one is off from their mean by
+    s sqrt(1 + 1 / V).
+
+    Args:
+        gains: Factors of red, green and blue that were undone, ``(V, 3)``; 1 for what was not beyond chance.
+
+    Returns:
+        Relative standard errors of red, green and blue; 0 where no camera was off, or there is but one.
+
+    Source: prediction of a further observation; what is common to all is stated apart, JCGM 100:2008 (GUM), 5.2.
+    """
+    logs = np.log(np.asarray(gains, np.float64))
+    if len(logs) < 2:
+        return (0.0, 0.0, 0.0)
+    red, green, blue = (logs.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(logs))).tolist()
+    return red, green, blue
+
+
 def _spread(values: ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(np.asarray(values)))))
 

@@ -275,6 +275,7 @@ def _judge_quality(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     if not 2 * len(noisy) > len(noises):
         noisy = {}  # texture of some views
     lossy = {glimpse.record.name: glimpse.quality.loss for glimpse in glimpses if glimpse.quality.loss > LOSSY}
+    blotted = {glimpse.record.name: glimpse.quality.blots for glimpse in glimpses if glimpse.quality.blots}
     for found, code, what, form, remedy in (
         (
             soft,
@@ -304,6 +305,13 @@ def _judge_quality(glimpses: Sequence[Glimpse], findings: Findings) -> None:
             f"compressed so that luminance may be off by more than {LOSSY:g} of 255 levels",
             "{:.1f}",
             "Base colour loses more than sharpness. Give images without loss, or JPEG of a quality of 95 or more.",
+        ),
+        (
+            blotted,
+            "mask-blots",
+            "masked with holes that show the subject, or islands that show the backdrop",
+            "{} px",
+            "A hole is cut into the subject, an island is taken for it. Make these masks again.",
         ),
     ):
         if found:

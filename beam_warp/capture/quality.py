@@ -11,6 +11,9 @@ is left of red, green and blue is in proportion; that of noise is not. So the le
 small square is noise, and so is texture of more than two colours; the lower quartile over squares is taken. Noise is
 taken to be that of photons, whose variance is in proportion to the value.
 
+*Blots.* Before an even backdrop, a mask's island that shows nothing but that, and a hole at whose edge the image has
+none, are in the wrong.
+
 Sources: slanted-edge measurement of sharpness (ISO 12233); Immerkær 1996 (noise by second differences).
 """
 
@@ -21,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, map_coordinates
+from scipy.ndimage import binary_erosion, convolve, distance_transform_edt, label, map_coordinates
 
 from beam_warp.capture.records import CaptureRecord
 from beam_warp.capture.views import CapturedView
@@ -78,6 +81,21 @@ LEAST_OVER_VARIANCE = 0.278
 """Quartile, over squares of noise alone, of the least eigenvalue of their channels' covariance, over the variance:
 by 40,000 draws."""
 
+SPECK = 24
+"""Parts of a mask of fewer pixels are not judged."""
+
+BEYOND = 6.0
+"""What lies further from the mask shows the backdrop [pixel]."""
+
+EVEN, UNLIKE = 0.1, 0.2
+"""Differences from a smooth backdrop, over its brightness, of pixels that show it, at most, and of others, at least."""
+
+ROUNDS = 6
+"""Rounds of reweighting."""
+
+CONTINUOUS = 1.0 / 3.0
+"""A hole shows the subject if its rim differs from what is beyond by less than this part of how the backdrop does."""
+
 DARK = 0.05
 """Squares below this part of the image's median level are left out: their noise is not the photons'."""
 
@@ -91,12 +109,14 @@ class ImageQuality:
         noise: Standard deviation of a colour channel, over its value, in the middle of the subject's levels.
         loss: How far JPEG may have moved its luminance, root mean square [level of 255]; 0 of other formats.
         by_coverage: Whether blur was seen in the coverage, whose edges are those of the lens alone, and not in colours.
+        blots: Pixels of islands of the mask that show the backdrop, and of holes that show the subject.
     """
 
     blur: tuple[float, float]
     noise: float
     loss: float
     by_coverage: bool
+    blots: int = 0
 
 
 def quality_of(record: CaptureRecord, view: CapturedView) -> ImageQuality:
@@ -116,7 +136,76 @@ def quality_of(record: CaptureRecord, view: CapturedView) -> ImageQuality:
     is_photograph = view.mask_offset is not None or record.mask_path is not None or record.plate_path is not None
     shown = record.image().linear_rgba()[..., :3] if is_photograph else view.alpha[..., None]
     blur, noise = edge_blur(shown, view.alpha), _relative_noise(view.color, view.alpha > WHOLE)
-    return ImageQuality(blur, noise, loss, by_coverage=not is_photograph)
+    blots = blotted(shown, view.alpha) if is_photograph else 0
+    return ImageQuality(blur, noise, loss, by_coverage=not is_photograph, blots=blots)
+
+
+def blotted(image: NDArray[np.float32], alpha: NDArray[np.float32]) -> int:
+    """Return of how many pixels the parts of a mask are that are in the wrong.
+
+    Args:
+        image: Photograph of subject and backdrop, scene-linear, ``(H, W, 3)``.
+        alpha: Coverage, ``(H, W)``.
+
+    Returns:
+        Pixels of islands that show the backdrop and of holes that show the subject; 0 where the backdrop is not even.
+    """
+    covered = alpha > SOLID
+    islands, gaps = _labels(covered), _labels(~covered)
+    open_gaps = {0, *np.concatenate([gaps[0], gaps[-1], gaps[:, 0], gaps[:, -1]]).tolist()}
+    main = int(np.argmax(np.bincount(islands[covered]))) if covered.any() else 0
+    strays, holes = _parts(islands, {0, main}), _parts(gaps, open_gaps)
+    distance: Any = distance_transform_edt(~covered)  # its types say that it may be None
+    beyond = distance > BEYOND
+    if not (strays or holes) or beyond.sum() < FEWEST_PIXELS:
+        return 0
+    backdrop = _smooth(image, beyond)
+    brightness = np.maximum(backdrop.mean(axis=-1), 1e-9)
+    off = np.abs(image - backdrop).max(axis=-1) / brightness
+    if not np.quantile(off[beyond], 1.0 - QUARTILE) < EVEN:
+        return 0
+    found = 0
+    for part in strays:
+        apart = (image - backdrop)[_eroded(part)].mean(axis=0)
+        found += int(part.sum()) * bool(np.abs(apart).max() < EVEN * brightness[part].mean())
+    nearest: Any = distance_transform_edt(~_eroded(covered), return_distances=False, return_indices=True)
+    for part in holes:
+        rim = _eroded(part) & ~_eroded(part, 3)
+        across = np.abs(image[rim] - image[tuple(nearest[:, rim])]).max(axis=-1) / brightness[rim]
+        found += int(part.sum()) * bool(np.median(off[rim]) > max(UNLIKE, float(np.median(across)) / CONTINUOUS))
+    return found
+
+
+def _labels(covered: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return the number of the part that each pixel belongs to, from 1 on; 0 of none, ``(H, W)``."""
+    found: Any = label(covered)
+    return found[0]
+
+
+def _eroded(part: NDArray[np.bool_], times: int = 1) -> NDArray[np.bool_]:
+    """Return a part without its outermost pixels."""
+    return np.asarray(binary_erosion(part, iterations=times), bool)
+
+
+def _parts(labels: NDArray[np.int32], known: set[int]) -> list[NDArray[np.bool_]]:
+    """Return parts that are neither known nor specks, ``(H, W)`` each; those whose middle is left by an erosion."""
+    sizes = np.bincount(labels.ravel())
+    parts = (labels == k for k in np.flatnonzero(sizes >= SPECK).tolist() if k not in known)
+    return [part for part in parts if _eroded(part, 2).any()]
+
+
+def _smooth(image: NDArray[np.float32], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return an image that varies by a polynomial of the second degree, fitted to the chosen pixels, ``(H, W, 3)``."""
+    y, x = (np.linspace(-1.0, 1.0, length) for length in chosen.shape)
+    terms = np.stack([np.outer(y**k, x**j) for k in range(3) for j in range(3 - k)], axis=-1)
+    at = tuple(_some(np.argwhere(chosen), MOST_EDGES).T)
+    known, seen = terms[at], image[at].astype(np.float64)
+    found, weights = np.zeros((known.shape[1], 3)), np.ones(len(seen))
+    for _ in range(ROUNDS):  # of least absolute differences: what stands before the backdrop does not count
+        root = np.sqrt(weights)[:, None]
+        found = np.linalg.lstsq(root * known, root * seen, rcond=None)[0]
+        weights = 1.0 / np.maximum(np.abs(seen - known @ found).max(axis=1), max(1e-3 * float(np.median(seen)), 1e-12))
+    return terms @ found
 
 
 def edge_blur(image: NDArray[np.float32], alpha: NDArray[np.float32]) -> tuple[float, float]:

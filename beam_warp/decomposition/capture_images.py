@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.digests import CaptureDigests
+from beam_warp.capture.exposures import scale_errors
 from beam_warp.capture.findings import count_of, names_of
 from beam_warp.capture.inspect import SPLIT
 from beam_warp.capture.views import CapturedView
@@ -65,6 +66,10 @@ class CaptureImages:
             largest_value([view for view, of in zip(views, spaces, strict=True) if of == space], space)
             for space in set(spaces)
         )
+
+    def scale_errors(self) -> tuple[float, float, float]:
+        """Return by how much the light may differ in brightness from the first frame's images; see `scale_errors`."""
+        return scale_errors([record.gains for record in self._records[0]])
 
     def digest(self, index: int, digests: CaptureDigests) -> str:
         """Return the digest of a frame's images and cameras."""

@@ -45,6 +45,8 @@ class CaptureLight:
         turned_by: By how much it was turned [degree].
         scales: Least and largest factor that all base colours could have and be those of dielectrics; NaN where nothing
             was asked.
+        scale_errors: Relative standard errors of the scale of red, green and blue, which all base colours have in
+            common, as far as differences between cameras tell them; 0 where they tell nothing.
     """
 
     environment: EnvironmentMap
@@ -54,6 +56,7 @@ class CaptureLight:
     turn: LightTurn
     turned_by: float
     scales: tuple[float, float]
+    scale_errors: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, environment: EnvironmentMap, found: Mapping[str, NDArray[Any]], source: Source) -> CaptureLight:
@@ -63,7 +66,8 @@ class CaptureLight:
         with source.log.timer("prepare light"):
             prepared = PreparedEnvironment(turned, source.device).scaled(2.0**stops)
         turn, scales = LightTurn(degrees, error), (low * 2.0**stops, high * 2.0**stops)
-        return cls(turned.scaled(2.0**stops), prepared, stops, bool(is_fitted), turn, turned_by, scales)
+        errors = source.images.scale_errors() if source.has_light and source.images is not None else cls.scale_errors
+        return cls(turned.scaled(2.0**stops), prepared, stops, bool(is_fitted), turn, turned_by, scales, errors)
 
     @property
     def findings(self) -> list[Finding]:
@@ -79,6 +83,9 @@ class CaptureLight:
             "the scale of the light is as stated, and nothing in the images checks it closely: under a brighter or "
             f"dimmer one, base colours would be {least:.2g} to {most:.2g} times as bright"
         )
+        if any(self.scale_errors):
+            part = 100.0 * float(np.mean(self.scale_errors))
+            what += f"; if it was measured no better than cameras were exposed, {part:.0f} % is one standard error"
         remedy = "Base colours are as sure as the light's exposure: a grey card in the images would check it."
         return [Finding("note", "base-color-scale", what, remedy=remedy)]
 
@@ -99,6 +106,7 @@ class CaptureLight:
         return {
             "light_turn": {"degrees": degrees, "standard_error": error, "turned_by": self.turned_by},
             "base_color_scales": scales,
+            "base_color_scale_errors": list(self.scale_errors),
         }
 
 

@@ -110,6 +110,7 @@ def relightable_sequence(
             "source_axes": plan.source.first.original.axes,
             "exposure_stops": f"{plan.light.stops:.4f}",
             "light_turn_degrees": f"{plan.light.turned_by:.4f}",
+            "base_color_scale_errors": " ".join(f"{error:.4f}" for error in plan.light.scale_errors),
         },
     )
 

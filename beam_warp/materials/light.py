@@ -206,7 +206,7 @@ def _is_unlike(
     shown: LightEvidence, fits: LightFits, way: int, cells: NDArray[np.float64], environment: EnvironmentMap
 ) -> bool:
     """Return whether a light, at its best turn, leaves shading between neighbours that another light explains."""
-    if fits.clearly(EVEN, way) > 1.0 or weaker_explains(shown, cells) > 1.0:
+    if weaker_explains(shown, cells) > 1.0:
         return True
     light = EnvironmentMap(environment.radiance[:, ::-1].copy()) if way >= LIGHT_COLUMNS else environment
     return missing_light(shown, turned_cells(light, np.array([_refined(fits, way)]))[:, 0]).is_certain

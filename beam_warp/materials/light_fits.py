@@ -15,7 +15,8 @@ jackknife, Efron and Stein 1981.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,12 @@ class LightEvidence:
     colors: NDArray[np.float32]
     weights: NDArray[np.float32]
     directions: NDArray[np.float32]
+
+    def some(self, rows: NDArray[Any] | slice) -> LightEvidence:
+        """Return the evidence of some of the points."""
+        by_point = {name: getattr(self, name)[rows] for name in ("positions", "normals", "openness")}
+        by_view = {name: getattr(self, name)[:, rows] for name in ("colors", "weights", "directions")}
+        return LightEvidence(**by_point, **by_view)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,14 +223,7 @@ def well_shown(evidence: LightEvidence) -> LightEvidence:
     facing = np.einsum("vmk,mk->vm", evidence.directions, evidence.normals)
     weights = evidence.weights * np.clip((facing - 0.2) / 0.3, 0.0, 1.0)
     asked = (weights.sum(axis=0) > 0.0) & ((weights * (evidence.colors @ LUMINANCE)).sum(axis=0) > 0.0)
-    return LightEvidence(
-        positions=evidence.positions[asked],
-        normals=evidence.normals[asked],
-        openness=evidence.openness[asked],
-        colors=evidence.colors[:, asked],
-        weights=weights[:, asked],
-        directions=evidence.directions[:, asked],
-    )
+    return replace(evidence, weights=weights).some(asked)
 
 
 def mean_colors(shown: LightEvidence) -> NDArray[np.float64]:

@@ -16,10 +16,11 @@ Source: see `beam_warp.materials.light_fits`; the jackknife, Efron and Stein 198
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
 from beam_warp.materials.light_fits import (
@@ -186,18 +187,22 @@ def missing_light(shown: LightEvidence, cells: NDArray[np.float32]) -> MissingLi
     explain, up to the second degree, may be paint: on a ball that is all, and nothing is known. Each part of the
     surface is explained by what the others give, so that what is fitted to chance explains nothing.
 
+    A normal that is off makes a point too bright or too dark for it, as if another light fell there. So points are
+    compared under their own normals, but harmonics are those of mean normals around them, whose errors are others.
+
     Args:
         shown: Well-shown points, at least `LEAST_POINTS`.
         cells: Irradiance that each cell sends [W/m²], ``(L, 3)``.
 
-    Source: nine harmonics hold all but a few percent of irradiance, Ramamoorthi and Hanrahan 2001.
+    Source: nine harmonics hold all but a few percent of irradiance, Ramamoorthi and Hanrahan 2001; split-sample
+    instruments against errors in variables, Angrist and Krueger 1995.
     """
     parts = parts_of(shown.positions)
-    first, second = neighbor_pairs(shown, NEIGHBORS)
+    first, second, around = _halves(shown, NEIGHBORS)
     base = (shown_colors(shown) - log_irradiance(shown, cells[:, None])[:, 0]).mean(axis=1)
     places = shown.positions.astype(np.float64) - shown.positions.mean(axis=0)
     of_places = _harmonics(places / max(float(places.std()), 1e-12), squares=3)
-    of_normals = _harmonics(shown.normals.astype(np.float64))
+    of_normals = _harmonics(around.normals.astype(np.float64))
     if _alike(of_places, of_normals) > MOST_ALIKE:
         return MissingLight(0.0, float("inf"), 0.0)
     differences, groups = base[first] - base[second], parts[first]
@@ -214,6 +219,31 @@ def missing_light(shown: LightEvidence, cells: NDArray[np.float32]) -> MissingLi
     error = float(np.sqrt((len(left_out) - 1) * left_out.var()))
     size = float((of_normals @ whole[of_places.shape[1] :]).std())
     return MissingLight(float(np.log(before.sum() / max(after.sum(), 1e-12))), error, size)
+
+
+def _halves(shown: LightEvidence, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], LightEvidence]:
+    """Return pairs of neighbours within either half of the points, and the points with normals of the other half.
+
+    Args:
+        shown: The points.
+        count: Neighbours that each point is compared with.
+
+    Returns:
+        Rows of the one and the other of each pair, ``(P,)`` each, and the points with the mean normals of the nearest
+        ones of the other half that do not face away; with their own where all do.
+    """
+    halves = [np.arange(half, len(shown.positions), 2) for half in (0, 1)]
+    pairs = [half[np.stack(neighbor_pairs(shown.some(half), count))] for half in halves]
+    around = np.zeros_like(shown.normals)
+    for half, others in (halves, halves[::-1]):
+        near = cKDTree(shown.positions[others]).query(shown.positions[half], k=NEIGHBORS // 2, workers=-1)[1]
+        normals = shown.normals[others[near]]
+        facing = np.einsum("mki,mi->mk", normals, shown.normals[half]) > 0.0
+        around[half] = np.einsum("mki,mk->mi", normals, facing)
+    length = np.linalg.norm(around, axis=1, keepdims=True)
+    normals = np.divide(around, length, out=shown.normals.copy(), where=length > 0.0)
+    first, second = np.concatenate(pairs, axis=1)
+    return first, second, replace(shown, normals=normals)
 
 
 def _harmonics(vectors: NDArray[np.float64], *, squares: int = 2) -> NDArray[np.float64]:
@@ -251,17 +281,23 @@ def weaker_explains(shown: LightEvidence, light: NDArray[np.float64]) -> float:
     """Return how clearly a light of half the contrast explains what is shown better: above 1 is a verdict.
 
     Shading of the right light, raised to a power, leaves neighbours' base colours most alike at a power of 1. Another
-    light is right about some of the shading at best, so that less of it explains more.
+    light is right about some of the shading at best, so that less of it explains more. So it is of normals that are
+    off, under the right light too: the shading that is raised is what mean normals around the points, whose errors are
+    others, predict of it.
 
     Args:
         shown: Well-shown points, at least `LEAST_POINTS`.
         light: Radiance of the cells, ``(L, 3)``.
     """
-    colors = shown_colors(shown)
-    irradiance = log_irradiance(shown, (light * cell_angles()[:, None])[:, None].astype(np.float32))[:, 0]
-    base = np.concatenate([colors - irradiance, colors - 0.5 * irradiance], axis=1)
-    apart, _ = neighbor_differences(shown, base, parts_of(shown.positions), TURN_NEIGHBORS)
-    full, half = apart.reshape(len(apart), 2, 3).sum(axis=2).T
+    parts, colors = parts_of(shown.positions), shown_colors(shown)
+    cells = (light * cell_angles()[:, None])[:, None].astype(np.float32)
+    first, second, around = _halves(shown, TURN_NEIGHBORS)
+    logs = (colors, log_irradiance(shown, cells)[:, 0], log_irradiance(around, cells)[:, 0])
+    seen, own, smooth = (values[first] - values[second] for values in logs)
+    shading = smooth * ((smooth * own).sum(axis=0) / np.maximum(np.square(smooth).sum(axis=0), 1e-12))
+    full, half = (
+        np.bincount(parts[first], np.abs(seen - power * shading).sum(axis=1), parts.max() + 1) for power in (1.0, 0.5)
+    )
     left_out = np.log(np.maximum(full.sum() - full, 1e-6) / np.maximum(half.sum() - half, 1e-6))
     chance = stdtrit(len(full) - 1, 1.0 - CHANCE) * float(np.sqrt((len(full) - 1) * left_out.var()))
     gain = float(np.log(max(full.sum(), 1e-6) / max(half.sum(), 1e-6)))

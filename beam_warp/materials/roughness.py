@@ -99,11 +99,13 @@ class RoughnessProfile:
             residual, s 0.06 of what a white surface would show with nothing in the way.
         views: Sum of w over all views: how many that see a whole pixel from the front, ``(N,)``; 0 where there is none.
         frames: Number of frames.
+        tilt: Sum over frames of the squared angle that normals are off by, times the views, ``(N,)`` [rad^2].
     """
 
     misfit: NDArray[np.floating[Any]]
     views: NDArray[np.floating[Any]]
     frames: int = 1
+    tilt: NDArray[np.floating[Any]] | float = 0.0
 
     def __post_init__(self) -> None:
         """Check shapes once."""
@@ -124,6 +126,7 @@ class RoughnessProfile:
             np.add(self.misfit, other.misfit, dtype=np.float64),
             np.add(self.views, other.views, dtype=np.float64),
             self.frames + other.frames,
+            np.add(self.tilt, other.tilt, dtype=np.float64),
         )
 
 
@@ -154,7 +157,8 @@ class RoughnessEstimate:
 
     Attributes:
         roughness: Mean of each Gaussian's distribution, perceptual, ``(N,)`` float32.
-        standard_error: Its standard deviation, joined with `MODEL_ERROR`, ``(N,)`` float32.
+        standard_error: Its standard deviation, joined with `MODEL_ERROR` and with how much too rough lobes look under
+            normals that are off, ``(N,)`` float32.
         informed: False where the data adds little to the prior, ``(N,)`` bool.
         prior: What all Gaussians together say, or what was given.
         report: How it came about, JSON-ready: ``informed_part``, ``median_error``, ``frames``; the ``prior_mean`` and
@@ -220,7 +224,8 @@ def measure_roughness_profile(
     misfit = np.zeros((int(PARTS), count, len(CANDIDATES)), np.float32)
     counted = np.zeros(count, np.float32)
     misfit[:, shown], counted[shown] = fit.misfit.numpy(), fit.views.numpy()
-    return RoughnessProfile(misfit, counted)
+    # The normal is a mean over views, whose errors have little in common.
+    return RoughnessProfile(misfit, counted, tilt=np.minimum(counted, 1.0) * points.normal_error**2)
 
 
 def solve_roughness(
@@ -255,7 +260,8 @@ def solve_roughness(
         return _estimate(means, errors, np.zeros(len(places), bool), chosen, moments, report)
     seen = places[known]
     tree = cKDTree(seen[_along_curve(seen)][::CLUSTER])
-    clusters = _cluster_sums(np.asarray(profile.misfit, np.float64)[:, known], tree.query(seen, workers=-1)[1], tree.n)
+    cluster = tree.query(seen, workers=-1)[1]
+    clusters = _cluster_sums(np.asarray(profile.misfit, np.float64)[:, known], cluster, tree.n)
     resample = CubicSpline(CANDIDATES, np.eye(len(CANDIDATES)))(GRID).T
     near, wide = (_sums_around(tree, clusters, count) @ resample for count in (NEAR, WIDE))
     asked = slice(None, None, -(-tree.n // MOST_ASKED))
@@ -267,12 +273,29 @@ def solve_roughness(
     distribution = _normalized(_widened(outside, step) + inside)
     mean, spread = _moments(distribution)
     moments = _moments(_widened(_log_prior(chosen), step))
+    tilts = np.stack([np.broadcast_to(profile.tilt, len(places)), profile.views])[:, known, None].astype(np.float64)
+    tilt, views = _sums_around(tree, _cluster_sums(tilts, cluster, tree.n), NEAR)[..., 0]
+    wide_by = mean - narrowed(mean, tilt / views)
     weight, index = _nearest(tree, places)
     roughness = (weight * mean[index]).sum(axis=1)
-    error = np.sqrt((weight * np.square(spread[index])).sum(axis=1) + MODEL_ERROR**2)
+    error = np.sqrt((weight * (np.square(spread) + np.square(wide_by))[index]).sum(axis=1) + MODEL_ERROR**2)
     informed = (weight * spread[index]).sum(axis=1) < INFORMED_PART * moments[1]
     report = {"near": near_evidence, "wide": wide_evidence, "step": step, "frames": profile.frames}
     return _estimate(roughness, error, informed, chosen, moments, report)
+
+
+def narrowed(roughness: NDArray[np.floating[Any]], tilt: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Return the roughness of lobes that look so rough because normals are off; no less than the smoothest candidate.
+
+    Mirrored at normals that scatter by an angle a, a lobe of alpha = r^2 is seen as one of alpha^2 + a^2.
+
+    Args:
+        roughness: Perceptual, as it looks.
+        tilt: Mean of a^2 over both directions together [rad^2].
+
+    Source: Olano and Baker 2010, "LEAN mapping": variances of slopes add up; alpha^2 is twice that of one direction.
+    """
+    return np.maximum(roughness**4 - tilt, CANDIDATES[0] ** 4) ** 0.25
 
 
 class _Evidence(NamedTuple):

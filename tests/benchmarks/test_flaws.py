@@ -159,7 +159,7 @@ def test_what_was_refused_has_a_row():
 
 
 def test_a_case_is_made_scored_and_continued(tiny_capture, tmp_path):
-    asked = argparse.Namespace(frames=1, gaussians=300, preset="draft", device="cpu")
+    asked = argparse.Namespace(frames=1, gaussians=300, preset="draft", device="cpu", naming=None)
     row = benchmark.measure(tiny_capture, "noise", 1.0, 0, asked, tmp_path)
     assert row["gaussians"] <= 300
     assert set(row["named"]) == {"noise"}
@@ -167,3 +167,19 @@ def test_a_case_is_made_scored_and_continued(tiny_capture, tmp_path):
     assert 0.0 < row["errors"]["base_color"]["within_1"] <= row["errors"]["base_color"]["within_2"] <= 1.0
     assert row["recovered"]["light_stops_injected"] == 0.0
     json.dumps(row)
+
+
+def test_a_case_is_named_without_materials_at_half_the_resolution(tiny_capture, tmp_path):
+    asked = argparse.Namespace(frames=1, gaussians=300, preset="draft", device="cpu")
+    small = benchmark.reduced(tiny_capture, 2)
+    record, whole = small.records[0], tiny_capture.records[0]
+    assert record.view().camera.width == record.camera.width == whole.camera.width // 2
+    np.testing.assert_array_equal(record.view().color, whole.view().reduced(2).color)
+    for asked.naming in ("images", "rig", "all"):
+        (tmp_path / asked.naming).mkdir()
+        row = benchmark.measure(small, "jpeg", 2.0, 0, asked, tmp_path / asked.naming)
+        assert row["named"] == {"jpeg": True}
+        assert "scores" not in row
+    assert "jpeg-loss" in benchmark.in_a_line(row)
+    head, cells = tables_flaws.named({"rows": [{"case": {"capture": "a", "flaw": "jpeg", "size": 2.0}, **row}]})
+    assert (len(head), cells[1].split(",")[0]) == (len(cells), "jpeg")

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import t
 from support.fake_steps import write_capture
 
 from beam_warp.capture.capture import Capture
-from beam_warp.capture.exposures import CameraExposure, RigExposures
+from beam_warp.capture.exposures import CameraExposure, RigExposures, scale_errors
 from beam_warp.errors import AssetFormatError
 
 FOUND = RigExposures(
@@ -56,3 +57,16 @@ def test_files_come_back_and_damage_is_named(tmp_path):
         path.write_text(content)
         with pytest.raises(AssetFormatError, match="exposures of cameras must be as beam reconstruct wrote them"):
             RigExposures.read(tmp_path)
+
+
+def test_the_scale_s_error_is_that_of_a_light_measured_by_one_more_camera(rng):
+    """Errors over stated ones are those of Student's distribution, with as many degrees as V cameras have."""
+    count, cameras = 4000, 8
+    logs = 0.1 * rng.normal(size=(count, cameras + 1, 3))
+    gains = np.exp(logs[:, :cameras] - logs[:, :cameras].mean(axis=1, keepdims=True))
+    off = logs[:, cameras] - logs[:, :cameras].mean(axis=1)
+    z = np.abs(off / np.array([scale_errors(rig) for rig in gains]))
+    for sigma in (1.0, 2.0):
+        part = 2.0 * t(cameras - 1).cdf(sigma) - 1.0
+        assert abs((z < sigma).mean() - part) < 4.0 * np.sqrt(part * (1.0 - part) / z.size)
+    assert scale_errors(np.ones((5, 3))) == scale_errors(gains[0, :1]) == (0.0, 0.0, 0.0)

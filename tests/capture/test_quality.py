@@ -1,6 +1,7 @@
 """Sharpness, noise and compression of images: blurs, noise and steps that are known, and copies of the walker."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from support.discs import SIDE, WALL, before, disc
 
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.inspect import inspect_capture
-from beam_warp.capture.quality import FEWEST, _deviations, edge_blur, photon_noise
+from beam_warp.capture.quality import FEWEST, _deviations, blotted, edge_blur, photon_noise
 from beam_warp.image.files import quantization_error
 from beam_warp.stability.flaws.optics import defocused, motion_blurred
 from beam_warp.stability.flaws.write import write_flawed
@@ -58,6 +59,21 @@ def test_directions_without_edges_are_not_blurred():
     assert _deviations(quartiles.repeat(FEWEST), normals) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("noise", [0.0, 4e-4])
+def test_holes_and_islands_of_a_mask_are_told_from_the_subject_s_own(noise):
+    """A disc, one with a hole, and one with another beside it: each as the subject, and as its mask."""
+    shapes = {"disc": disc(), "ring": disc() - disc(radius=6.0), "pair": disc() + disc(radius=5.0, center=(8.0, 10.0))}
+    hole, island = (int(((shapes[name] > 0.5) != (shapes["disc"] > 0.5)).sum()) for name in ("ring", "pair"))
+    wrong = {("disc", "ring"): hole, ("disc", "pair"): island, ("ring", "pair"): island, ("pair", "ring"): hole}
+    for (subject, true), (name, mask) in product(shapes.items(), shapes.items()):
+        photograph = gaussian_filter(before(WALL, true), (0.7, 0.7, 0.0), mode="nearest")
+        if noise:
+            photograph = (RNG.poisson(photograph / noise) * noise).astype(np.float32)
+        assert blotted(photograph, mask) == wrong.get((subject, name), 0)
+    clutter = (WALL * RNG.uniform(0.2, 2.0, WALL.shape)).astype(np.float32)
+    assert blotted(before(clutter, shapes["disc"]), shapes["pair"]) == 0
+
+
 def test_nothing_tells_without_an_outline():
     assert np.isnan(edge_blur(WALL, np.ones((SIDE, SIDE), np.float32))).all()
     assert np.isnan(photon_noise(WALL, np.zeros((SIDE, SIDE), bool)))
@@ -93,11 +109,12 @@ def test_steps_of_a_jpeg_say_how_far_its_luminance_is_off(tmp_path, quality):
         (("motion-blur",), 2.0, {"motion-blur"}),
         (("noise",), 2.0, {"noisy-images"}),
         (("jpeg",), 1.0, {"jpeg-loss"}),
+        (("blots",), 1.0, {"mask-blots"}),
     ],
 )
 def test_flaws_of_images_are_named(data_dir, tmp_path, flaws, size, said):
     clean = Capture.read(data_dir / "captures" / "walker")
     few = replace(clean, records=clean.select(split="train", frames={0})[::3])
     found = inspect_capture(write_flawed(few, tmp_path / "flawed", flaws, size=size).capture).findings
-    named = {"soft-images", "motion-blur", "noisy-images", "jpeg-loss"}
+    named = {"soft-images", "motion-blur", "noisy-images", "jpeg-loss", "mask-blots"}
     assert {finding.code for finding in found} & named == said

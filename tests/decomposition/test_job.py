@@ -402,6 +402,14 @@ class TestWithACapture:
         images = CaptureImages(replace(tiny_capture, records=(gone, *tiny_capture.records[1:])), discs)
         assert [len(images.views(index)) for index in range(2)] == [5, 6]
         assert images.notes == [f"1 image missing, left out: {gone.name}"]
+        assert images.scale_errors() == (0.0, 0.0, 0.0)
+
+    def test_differences_between_cameras_are_an_error_of_the_scale(self, discs, tiny_capture):
+        gains = [(1.0 + 0.1 * (k % 2), 1.0, 1.0) for k in range(len(tiny_capture.records))]
+        matched = [replace(record, gains=gain) for record, gain in zip(tiny_capture.records, gains, strict=True)]
+        red, green, blue = CaptureImages(replace(tiny_capture, records=tuple(matched)), discs).scale_errors()
+        assert green == blue == 0.0
+        assert 0.05 < red < 0.06  # of six cameras: half of log 1.1, times the root of 6 / 5 and of 7 / 6
 
     def test_images_without_a_scale_ask_for_an_exposure(self, discs, studio, capture, tmp_path):
         """8-bit images carry no scale: the same light four times as bright gives the same base colour.
@@ -432,7 +440,10 @@ class TestWithACapture:
         np.testing.assert_array_equal(found.environment.radiance, expected.radiance)
         turned_by = 6.0 if turns else 0.0
         assert found.report["light_turn"] == {"degrees": 6.0, "standard_error": 1.25, "turned_by": turned_by}
-        assert read(found.asset).metadata["light_turn_degrees"] == f"{turned_by:.4f}"
+        metadata = read(found.asset).metadata
+        assert metadata["light_turn_degrees"] == f"{turned_by:.4f}"
+        assert metadata["base_color_scale_errors"] == "0.0000 0.0000 0.0000"
+        assert found.report["base_color_scale_errors"] == [0.0, 0.0, 0.0]
         assert ("turned by +6.0 degrees" in found.report["light"]) == turns
         said = next(text for text in found.report["warnings"] if "up axis" in text)
         assert "+6.0 ± 1.2 degrees" in said

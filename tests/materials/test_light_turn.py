@@ -181,6 +181,24 @@ def test_less_contrast_explains_more_of_another_light_only(name):
     assert said == ["environment-unexplained"]
 
 
+def tilted(evidence, angle):
+    """Evidence whose normals are off by independent angles, ``angle`` in the root mean square [rad]."""
+    off = np.random.default_rng(1).normal(scale=angle / np.sqrt(2.0), size=evidence.normals.shape)
+    normals = evidence.normals + off
+    return replace(evidence, normals=(normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32))
+
+
+@pytest.mark.parametrize(("name", "other"), [("studio", "stage"), ("stage", "sunset")])
+def test_errors_of_normals_are_no_other_light(name, other):
+    """The right light, two degrees askew, explains under normals 17 degrees off; another under 11 still does not."""
+    right = LIGHTS[name]
+    for evidence in (bunch(right), Ball.of(count=800).evidence(right)):
+        assert judge_light(tilted(noisy(evidence, 2), 0.3), right.rotated(2.0)).findings == ()
+    scaled = LIGHTS[other].scaled(right.mean_radiance().mean() / LIGHTS[other].mean_radiance().mean())
+    said = judge_light(tilted(noisy(bunch(right), 2), 0.2), scaled).findings
+    assert [finding.code for finding in said] == ["environment-unexplained"]
+
+
 def test_smooth_light_is_explained_and_paint_is_not():
     """White times e^(x / 2): most is explained, and its size found. Paint of any kind, and of places: none."""
     light, rng = LIGHTS["studio"], np.random.default_rng(0)
@@ -189,7 +207,8 @@ def test_smooth_light_is_explained_and_paint_is_not():
     found = missing_light(replace(white, colors=white.colors * smooth), cells_of(light))
     assert found.gain > 0.7  # half of it
     assert found.is_certain
-    np.testing.assert_allclose(found.size, 0.5 * white.normals[:, 0].std(), rtol=0.05)
+    # what mean normals of neighbours are apart from the points' own, of 200 on a ball, makes it look a little smaller
+    np.testing.assert_allclose(found.size, 0.5 * white.normals[:, 0].std(), rtol=0.1)
     spots = well_shown(bunch(light, paint=rng.uniform(0.1, 0.9, (200, 3))))
     assert not missing_light(spots, cells_of(light)).is_certain
     faded = np.exp(0.3 * white.positions[:, :1]).astype(np.float32)
@@ -218,4 +237,6 @@ def test_how_far_base_colors_are_known_is_said():
     assert (turned.code, turned.severity) == ("environment-turned", "warning")
     assert (scale.code, scale.severity) == ("base-color-scale", "note")
     assert "0.2 to 0.9 times as bright" in str(scale)
+    assert "standard error" not in str(scale)
+    assert "10 % is one standard error" in str(replace(known, scale_errors=(0.1, 0.09, 0.11)).findings[1])
     assert replace(known, turn=LightTurn(), scales=(float("nan"), float("nan"))).findings == []

@@ -1,5 +1,6 @@
 """Roughness from photographs: known ones come back within their stated error; where data is mute nothing is claimed."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -27,6 +28,7 @@ from beam_warp.materials.roughness import (
     RoughnessPrior,
     RoughnessProfile,
     measure_roughness_profile,
+    narrowed,
     solve_roughness,
 )
 from beam_warp.world.environment import EnvironmentMap, texel_directions
@@ -52,7 +54,13 @@ def light_of(sky, device):
     return PreparedEnvironment(environment, wp.get_device(device))
 
 
-def profile_of(sky, roughness, device, *, count=800, view_count=20, noise=NOISE, frame=0, base_color=None):
+def tilted(normals, angle):
+    """Unit normals that are off by independent angles, ``angle`` in the root mean square [rad]."""
+    off = normals + np.random.default_rng(7).normal(scale=angle / np.sqrt(2.0), size=normals.shape)
+    return off / np.linalg.norm(off, axis=1, keepdims=True)
+
+
+def profile_of(sky, roughness, device, *, count=800, view_count=20, noise=NOISE, frame=0, base_color=None, tilt=0.0):
     """What a lone sphere of known roughness says, its photographs computed by the full integral; and its points."""
     rng = np.random.default_rng(1000 * view_count + frame)
     normals, spacing = sphere_points(count)
@@ -76,7 +84,7 @@ def profile_of(sky, roughness, device, *, count=800, view_count=20, noise=NOISE,
 
     ones = np.ones(count, np.float32)
     lifts = wp.full(count, 4.0 * spacing, dtype=float, device=scene.device)
-    points = SurfacePoints(vectors(normals), vectors(normals), lifts, ones > 0.0, 0.0 * ones, ones)
+    points = SurfacePoints(vectors(normals), vectors(tilted(normals, tilt)), lifts, ones > 0.0, 0.0 * ones, ones)
     views = ViewEvidence(
         points.positions,
         points.normals,
@@ -98,6 +106,24 @@ def within(found, truth, errors):
     return (np.abs(found.roughness - truth) < errors * found.standard_error).mean()
 
 
+@pytest.mark.parametrize("roughness", [0.2, 0.4, 0.6])
+@pytest.mark.parametrize("angle", [0.05, 0.1, 0.2])
+def test_a_mean_of_tilted_lobes_is_a_wider_one(roughness, angle):
+    """The lobe that is nearest to a mean of 4,000 tilted ones, in least squares over the hemisphere."""
+    polar, tries = np.linspace(0.0, 1.2, 200), np.linspace(0.15, 0.7, 221)
+    halves = np.stack([np.sin(polar), np.zeros(200), np.cos(polar)], axis=1)
+    cosines = np.clip(halves @ tilted(np.tile([0.0, 0.0, 1.0], (4000, 1)), angle).T, 0.0, 1.0)
+
+    def lobe(cosine, alpha):
+        return alpha**2 / (np.pi * (cosine**2 * (alpha**2 - 1.0) + 1.0) ** 2)
+
+    mean = lobe(cosines, roughness**2).mean(axis=1)
+    apart = [(np.sin(polar) * (mean - lobe(np.cos(polar), r**2)) ** 2).sum() for r in tries]
+    looks = (roughness**4 + angle**2) ** 0.25
+    assert tries[np.argmin(apart)] == pytest.approx(looks, abs=0.02)  # a mean of GGX lobes is nearly one
+    assert narrowed(np.array(looks), np.array(angle**2)) == pytest.approx(roughness)
+
+
 class TestKnownSpheres:
     @pytest.mark.parametrize("truth", [0.2, 0.5, 0.8])
     def test_roughness_comes_back_within_its_stated_error(self, truth, device):
@@ -106,6 +132,15 @@ class TestKnownSpheres:
         assert within(found, truth, 2.0) > 0.95  # a normal distribution's
         assert np.median(found.standard_error) < 0.1  # the prior's, before any data, is 0.21
         assert abs(found.report["prior_mean"] - truth) < 0.1
+
+    def test_normals_that_are_off_make_lobes_look_rough_and_errors_say_so(self, device):
+        positions, profile = profile_of(SKY, 0.35, device, tilt=0.25)
+        silent = solve_roughness(positions, profile)
+        found = solve_roughness(positions, replace(profile, tilt=0.25**2 * profile.views))
+        assert np.array_equal(found.roughness, silent.roughness)
+        assert np.median(found.roughness) > 0.4
+        assert within(silent, 0.35, 2.0) < 0.9
+        assert within(found, 0.35, 2.0) > 0.95
 
     def test_stated_errors_cover_what_many_places_are_off(self, device):
         """Neighbours are wrong together: 1600 Gaussians are 100 places of 16, and their share binomial.

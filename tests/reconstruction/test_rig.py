@@ -8,12 +8,14 @@ from scipy.spatial.transform import Rotation
 from support.moving_ball import ball_views
 from support.moving_ball import rig as cameras_around
 
-from beam_warp.capture.corrections import move_between, moved_camera
+from beam_warp.capture.corrections import RigCorrection, move_between, moved_camera
 from beam_warp.errors import AssetFormatError
 from beam_warp.reconstruction import rig
 from beam_warp.reconstruction.alignment import Evidence, flow_of
 from beam_warp.reconstruction.fit import FitOptions
-from beam_warp.reconstruction.rig import in_gauge, pixels_of, refine_rig, wrong_kinds
+from beam_warp.reconstruction.initial import initial_gaussians
+from beam_warp.reconstruction.labels import agreement_of
+from beam_warp.reconstruction.rig import distortion_of, in_gauge, pixels_of, refine_rig, wrong_kinds
 
 POSE = ("turn", "shift")
 
@@ -105,6 +107,17 @@ def test_chance_is_no_kind_and_what_is_wrong_is_named(rng, points):
     assert wrong_kinds(says(rng, points, one, 0.1)) == ("turn",)
 
 
+def test_lenses_that_nobody_states_are_told_by_their_size(rng, points):
+    cameras, truth = cameras_around(12), np.zeros((12, 11))
+    assert distortion_of(cameras, says(rng, points, truth, 0.1), points) == 0.0
+    truth[:, 9] = np.where(np.arange(12) % 2, 0.2, -0.2)
+    size = np.sqrt(np.mean(np.square(apart(cameras, truth, points))))
+    assert distortion_of(cameras, says(rng, points, truth, 0.1), points) == pytest.approx(size, rel=0.2)
+    said = RigCorrection((), is_applied=False, confidence=1.0, distortion=0.3)
+    assert [finding.code for finding in said.findings()] == ["lens-distortion"]
+    assert RigCorrection.from_dict(said.as_dict()) == said
+
+
 def test_a_camera_that_is_met_much_worse_is_left_out(device, monkeypatch):
     """One of eight cameras looks a third of the ball aside; the others are refined without it."""
     monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 3, 1, 1),))
@@ -122,6 +135,43 @@ def test_a_camera_that_is_met_much_worse_is_left_out(device, monkeypatch):
     assert too_few is not None
     assert not too_few.is_applied
     assert [camera.camera for camera in too_few.cameras if not camera.is_used] == ["c3"]
+
+
+def exchanged(views, order):
+    """The photographs under each other's names: camera k has that of ``order[k]``."""
+    return [replace(views[photograph], camera=view.camera) for view, photograph in zip(views, order, strict=True)]
+
+
+def test_labels_that_were_swapped_are_told_where_silhouettes_are_alike(device, monkeypatch):
+    """Photographs of a ball from two sides under each other's names: both are left out."""
+    monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 3, 1, 1),))
+    views, options = ball_views(cameras_around(8, 40)), FitOptions.of_preset("draft", gaussian_count=500)
+    found = refine_rig([f"c{k}" for k in range(8)], exchanged(views, [0, 4, 2, 3, 1, 5, 6, 7]), options, device=device)
+    assert found is not None
+    assert [camera.camera for camera in found.cameras if not camera.is_used] == ["c1", "c4"]
+
+
+def test_a_rig_whose_cameras_contradict_each_other_is_refused(device, monkeypatch):
+    """All labels in another order: what the photographs show of a ball has nothing in common."""
+    monkeypatch.setattr(rig, "LEVELS", (rig.Level(1, 1.0, 3, 1, 1),))
+    views, options = ball_views(cameras_around(8, 40)), FitOptions.of_preset("draft", gaussian_count=500)
+    with pytest.raises(AssetFormatError, match="of one's colours explained by the others'"):
+        refine_rig([f"c{k}" for k in range(8)], exchanged(views, [3, 6, 1, 7, 2, 4, 0, 5]), options, device=device)
+
+
+def test_where_all_sides_are_alike_nothing_tells_labels(device):
+    """An even ball has no wrong labels; a painted one shows them."""
+    views = ball_views(cameras_around(12, 40))
+    wrong = exchanged(views, [0, 6, 2, 3, 4, 5, 1, 7, 8, 9, 10, 11])
+    surface = initial_gaussians(views, 500, device=device)
+    sound, told = (agreement_of(some, surface, device=device) for some in (views, wrong))
+    assert sound.explained.min() > 0.9
+    assert not sound.swapped.any()
+    assert np.flatnonzero(told.swapped).tolist() == [1, 6]
+    even = [replace(view, color=np.repeat(view.alpha[..., None], 3, axis=2)) for view in wrong]
+    blank = agreement_of(even, surface, device=device)
+    assert (blank.explained == 1.0).all()
+    assert not blank.swapped.any()
 
 
 def test_two_captures_in_one_are_refused(device, monkeypatch):
