@@ -86,6 +86,8 @@ class RigCorrection(SideFile):
             [rad], shift [m] and the logarithm of scale, about the subject's middle, ``(7,)``.
         distortion: How far lenses move the subject in images beyond what is stated, root mean square [pixel], which
             nothing undoes; 0 where that is no more than chance.
+        explained: Part of the variance of the middle photograph's colours that the others explain where it is so little
+            that cameras may not be where they are stated; else 1.
     """
 
     FILE = "cameras.json"
@@ -97,6 +99,7 @@ class RigCorrection(SideFile):
     kinds: tuple[str, ...] = ()
     world: tuple[float, ...] = (0.0,) * 7
     distortion: float = 0.0
+    explained: float = 1.0
 
     def ways(self, cameras: Mapping[str, Camera], point: ArrayLike) -> dict[str, NDArray[np.float64]]:
         """Return which way corrections move a point in the images of cameras that were moved [pixel], ``(2,)`` each.
@@ -158,6 +161,13 @@ class RigCorrection(SideFile):
                 "nobody states distort, and are taken as they are"
             )
             found.append(Finding("warning", "lens-distortion", what, "", "State the lenses, or undistort the images."))
+        if self.explained < 1.0:
+            what = (
+                f"photographs explain {self.explained:.0%} of each other's colours: cameras are not where they are "
+                "stated, or the subject shows each of them something else, as a mirror does"
+            )
+            remedy = "Check which camera took which photograph, and that no two captures are mixed."
+            found.append(Finding("warning", "photographs-unlike", what, "", remedy))
         left_out = [camera.camera for camera in self.cameras if not camera.is_used]
         if left_out:
             found.append(
@@ -182,6 +192,7 @@ class RigCorrection(SideFile):
             "kinds": list(self.kinds),
             "world": list(self.world),
             "distortion": self.distortion,
+            "explained": self.explained,
             "cameras": [asdict(camera) for camera in self.cameras],
         }
 
@@ -197,6 +208,7 @@ class RigCorrection(SideFile):
             tuple(str(kind) for kind in content.get("kinds", ())),
             tuple(world.tolist()),
             require_number("distortion", content.get("distortion", 0.0), 0.0),
+            require_number("explained", content.get("explained", 1.0), 0.0, 1.0),
         )
 
 

@@ -86,7 +86,8 @@ if the run ends in anything but a reconstruction or a refusal where that is allo
 - The inspection, before anything starts: `black-image`, `empty-mask`, `missing-image`, `frame-lacks-cameras`,
   `few-cameras` below 8 of them; `camera-exposure` from {inspected:g} stops on, with 10 cameras or more.
 - The rig, in the first frame: `camera-contradicts` where a photograph is met far worse than others, or shows the hull
-  in colours that the others show where another camera is; a rig whose photographs have nothing in common is refused.
+  in colours that the others show where another camera is; `photographs-unlike` where they have nothing in common,
+  because labels are mixed or the subject is like a mirror.
 - The points of the surface that views share, in every frame: `camera-exposure` from {stops:g} stops on, which is undone
   before the frame is fitted or tracked; `few-cameras` where fewer than two views see most of the surface.
 - Tracking: `fast-motion` where a joint is farther from where its last step led than the coarsest level finds;
