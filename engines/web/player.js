@@ -12,7 +12,7 @@ import {enterVr, hasVr} from "./vr.js";
 
 const CHANNELS = {relit: "lit", base_color: "base colour", roughness: "roughness", ambient_occlusion: "ambient occlusion",
   normals: "normals", depth: "depth", alpha: "alpha", radiance: "captured colour"};
-const SHADOW_REGIONS = {0: "by ambient occlusion", 8: "by 8 maps", 16: "by 16 maps", 32: "by 32 maps"};
+const SHADOW_REGIONS = {0: "by occlusion", 8: "by 8 maps", 16: "by 16 maps", 32: "by 32 maps"};
 const TRANSFORMS = ["standard", "aces", "agx", "neutral"];
 const NONE = "none", SCALES = [1, 0.75, 0.5, 0.35, 0.25], SHADOWS = [1024, 1024, 512, 256, 256], SLOW = 80, FAST = 24, STILL = 200;
 const ASK_FOR_FILE = "Choose the .b4d file here, or serve the folder: python3 -m http.server";

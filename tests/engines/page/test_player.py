@@ -176,7 +176,7 @@ def test_an_environment_s_shadows_are_drawn_if_they_are_asked_for(opened, light,
     expected, alpha = as_rendered(page, cloud, EnvironmentMap.read(light), REGIONS)
     assert psnr(shadowed / 255.0, expected / 255.0, alpha > 0.99) > 38.0
     assert psnr(bare / 255.0, expected / 255.0, alpha > 0.99) < 30.0
-    page.get_by_label("Its shadows").select_option("by ambient occlusion")
+    page.get_by_label("Its shadows").select_option("by occlusion")
     np.testing.assert_array_equal(picture(page), bare)
 
 
