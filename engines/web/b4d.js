@@ -130,7 +130,7 @@ function check(said) {
  * earlier call gave. A worker can run this one: it uses nothing outside of itself. `transfer` lists the memory of the answer.
  */
 export function unpacking() {
-  const zlib = globalThis.process?.getBuiltinModule?.("node:zlib"); // the streams of Node.js take four times as long
+  const zlib = globalThis.process?.getBuiltinModule?.("node:zlib"); // its streams unpack the same, and slower
   const must = (condition, contract, got) => { if (!condition) throw new Error(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
   /** Put 0, -1, 1, -2, 2 … where octets 0, 1, 2, 3, 4 … stand: four words at a time, but for those before and after. */
@@ -226,7 +226,7 @@ function valuesAt(track, frame, none, start, values) {
   return values;
 }
 
-/** Put an offset, weighted octets and two weighted rows; eight numbers at a time, which takes three fifths of the time. */
+/** Put an offset, weighted octets and two weighted rows; eight numbers at a time, because the loop itself costs much of such a sum. */
 function putSum(out, offset, o, w, a, p, b, q) {
   let i = 0, count = out.length;
   for (; i < (count & 7); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i];
