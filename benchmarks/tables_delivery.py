@@ -29,11 +29,16 @@ def takes(result: Row) -> Rows:
                 cell(errors["occlusion"]["rms"], ".3f"),
                 cell(min(row["relit_psnr"].values()), ".1f"),
                 cell(row["relit_loss_db"], ".2f"),
-                *(", ".join(cell(row[key] and row[key][what], ".1f") for what in ("all", "random")) for key in decoders.values()),
+                *(_times(row[key]) for key in decoders.values()),
                 cell(row["write_seconds_a_frame"], ".2f"),
             ]
         )
     return rows
+
+
+def _times(found: Row | None) -> str:
+    """Return a frame's part of playing a take, and the time of one frame by itself [ms]."""
+    return "" if found is None else ", ".join(cell(found[what], ".1f") for what in ("all", "random"))
 
 
 @table("delivery_codecs", DELIVERY)
