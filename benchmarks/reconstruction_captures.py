@@ -143,9 +143,9 @@ def write_walking_capture(
     frame_count: int,
     case: bool,
     camera_count: int = 24,
-    test_camera_count: int = 3,
+    test_camera_count: int = 2,
     size: int = 320,
-    samples: int = 64,
+    samples: int = 32,
     subdivisions: int = 2,
     device: str | None = None,
 ) -> Capture:
