@@ -300,14 +300,21 @@ class Fitter:
         samples: Side of the square of samples of a pixel.
     """
 
-    def __init__(self, views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any) -> None:
-        """Bring everything to the device; see `fit_gaussians`."""
+    def __init__(
+        self,
+        views: Sequence[CapturedView],
+        start: GaussianCloud,
+        options: FitOptions,
+        device: Any,
+        targets: TargetSet | None = None,
+    ) -> None:
+        """Bring everything to the device, but for ``targets`` that are there already; see `fit_gaussians`."""
         self.options = options
         self.device = device
         count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
         self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
         self.samples = chosen_samples(options.samples, start, views)
-        self._targets = TargetSet(views, count, options.raster, self.samples, device)
+        self._targets = targets or TargetSet(views, count, options.raster, self.samples, device)
         center = np.median(start.positions, axis=0)
         extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
         self._limits = SamplingLimits([view.camera for view in views], device=device)

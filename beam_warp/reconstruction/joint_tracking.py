@@ -23,7 +23,7 @@ from beam_warp.reconstruction.fit import mean_psnr
 from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
-from beam_warp.reconstruction.targets import LossWeights, TargetSet, shuffled_views
+from beam_warp.reconstruction.targets import LossWeights, TargetSet, crop_views, shuffled_views
 from beam_warp.world.clusters import Clusters
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -129,7 +129,12 @@ class JointTracker:
         self._position_gradients = wp.zeros(count, dtype=wp.vec3, device=device)
 
     def find(
-        self, views: Sequence[CapturedView], starts: Mapping[str, JointPose], samples: int, seed: int
+        self,
+        views: Sequence[CapturedView],
+        starts: Mapping[str, JointPose],
+        samples: int,
+        seed: int,
+        whole: TargetSet | None = None,
     ) -> tuple[JointPose, str]:
         """Move the joints until what they carry looks like the views.
 
@@ -139,6 +144,7 @@ class JointTracker:
                 far as any, is begun with.
             samples: Side of the square of samples of a pixel at full resolution.
             seed: Seed of the order of views.
+            whole: The views at full resolution, for all Gaussians, where they are on the device already.
 
         Returns:
             The poses, and the name of those that they began with.
@@ -148,9 +154,11 @@ class JointTracker:
         rng = np.random.default_rng(seed)
         rates = {"rotations": chosen.rotation_rate, "positions": chosen.position_rate * self._spacing}
         for index, (level, iterations) in enumerate(zip(chosen.levels, chosen.iterations, strict=True)):
-            reduced = [view.reduced(min(level, view.camera.width, view.camera.height)) for view in views]
-            carried = self._all if level == 1 else self._for_views(reduced)
-            targets = TargetSet(reduced, carried.count, self._raster, samples if level == 1 else 1, self.device)
+            carried, targets = self._all, whole
+            if level > 1 or targets is None:
+                reduced = crop_views(views, [min(level, view.camera.width, view.camera.height) for view in views])
+                carried = self._all if level == 1 else self._for_views(reduced)
+                targets = TargetSet(reduced, carried.count, self._raster, samples if level == 1 else 1, self.device)
             adam = Adam(
                 {
                     "rotations": Parameters(self._rotations, self._rotation_gradients, rates["rotations"]),

@@ -17,7 +17,6 @@ from beam_warp.checks import require_number
 from beam_warp.device.array_checks import pixel_channels
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidOptionError
-from beam_warp.image.color import linear_to_srgb
 from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
     launch_add_sample_gradients,
@@ -78,37 +77,45 @@ class LossWeights:
             )
 
 
-def crop_views(views: Sequence[CapturedView]) -> list[CapturedView]:
+def crop_views(views: Sequence[CapturedView], reductions: Sequence[int] | None = None) -> list[CapturedView]:
     """Return the parts of the views where the subject is, of one size for all that have the same resolution.
 
     Views whose coverage is not known stay whole. Renders and losses cost as much as there are pixels.
+
+    Args:
+        views: What the cameras saw.
+        reductions: By which factor each view is reduced: sizes and margins are then those of reduced pixels. None
+            leaves all as they are.
     """
-    boxes = [_box(view) for view in views]
+    factors = reductions or [1] * len(views)
+    wholes = [
+        (view.camera.width // factor, view.camera.height // factor) for view, factor in zip(views, factors, strict=True)
+    ]
+    boxes = [_box(view, factor, whole) for view, factor, whole in zip(views, factors, wholes, strict=True)]
     sizes: dict[tuple[int, int], list[int]] = {}
-    for view, box in zip(views, boxes, strict=True):
-        largest = sizes.setdefault((view.camera.width, view.camera.height), [CROP_STEP, CROP_STEP])
+    for whole, box in zip(wholes, boxes, strict=True):
+        largest = sizes.setdefault(whole, [CROP_STEP, CROP_STEP])
         for axis in range(2):
             side = box[1][axis] - box[0][axis] + 2 * CROP_MARGIN
             largest[axis] = max(largest[axis], -(-side // CROP_STEP) * CROP_STEP)
     result = []
-    for view, (low, high) in zip(views, boxes, strict=True):
-        whole = (view.camera.width, view.camera.height)
+    for view, factor, whole, (low, high) in zip(views, factors, wholes, boxes, strict=True):
         size = [min(side, full) for side, full in zip(sizes[whole], whole, strict=True)]
         starts = [
             int(np.clip((low[axis] + high[axis] - size[axis]) // 2, 0, whole[axis] - size[axis])) for axis in range(2)
         ]
-        result.append(view.cropped(*starts, *size))
+        result.append(view.cropped(*(factor * number for number in (*starts, *size))).reduced(factor))
     return result
 
 
-def _box(view: CapturedView) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the first column and row of the subject, and the ones after its last."""
-    if view.alpha is None:
-        return (0, 0), (view.camera.width, view.camera.height)
-    rows, columns = (np.flatnonzero((view.alpha > 0.0).any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return (0, 0), (0, 0)
-    return (int(columns[0]), int(rows[0])), (int(columns[-1]) + 1, int(rows[-1]) + 1)
+def _box(view: CapturedView, factor: int, whole: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the first column and row of the subject in a reduced view, and the ones after its last."""
+    if view.subject is None:
+        return (0, 0), whole
+    (left, top), (right, bottom) = view.subject
+    end = min(-(-right // factor), whole[0]), min(-(-bottom // factor), whole[1])
+    start = left // factor, top // factor
+    return (start, end) if start[0] < end[0] and start[1] < end[1] else ((0, 0), (0, 0))
 
 
 class ViewTargets:
@@ -144,7 +151,7 @@ class ViewTargets:
         self.height, self.width = views[0].camera.height, views[0].camera.width
         self.samples = samples
         self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
-        self._colors = [upload(linear_to_srgb(view.color), float, self.device) for view in views]
+        self._colors = [_encoded(view.color, self.device) for view in views]
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
@@ -308,6 +315,14 @@ class ViewTargets:
         parts, count = labelled
         largest = np.bincount(parts.ravel())[1:].max() if count else 0
         return largest / max(self._subjects[index], 1)
+
+
+def _encoded(color: NDArray[np.float32], device: Any) -> wp.array:
+    """Bring scene-linear colour to a device, and encode it there as renders are."""
+    linear = upload(color, float, device)
+    encoded = wp.empty_like(linear)
+    launch_average(linear, 1, True, encoded, device)
+    return encoded
 
 
 class TargetSet:
