@@ -23,7 +23,7 @@ from beam_warp.reconstruction.fit import mean_psnr
 from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
-from beam_warp.reconstruction.targets import LossWeights, TargetSet, crop_views, shuffled_views
+from beam_warp.reconstruction.targets import LossWeights, TargetSet, ViewTargets, crop_views, shuffled_views
 from beam_warp.world.clusters import Clusters
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -177,8 +177,10 @@ class JointTracker:
                 for name, rate in rates.items():
                     left = chosen.final_rate ** (iteration / iterations)
                     adam.set_learning_rate(name, level * rate * left)
-                view = int(order[iteration])
-                graphs.run(view, partial(self._step, carried, targets, view, adam, chosen.rigidity / level**2))
+                group, place = targets[int(order[iteration])]
+                group.select(place)
+                step = partial(self._step, carried, group, place, adam, chosen.rigidity / level**2)
+                graphs.run(group.kind(place), step)
         rotations = self._rotations.numpy().astype(np.float64)
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
         positions = self._positions.numpy().copy()  # on the CPU it is the array
@@ -214,11 +216,9 @@ class JointTracker:
         anchors = Anchors(self._anchors.joints[merged.heaviest], self._anchors.weights[merged.heaviest])
         return _Carried(merged.cloud(self._cloud), anchors, self._joints, self._options.blend, self.device)
 
-    def _step(self, carried: _Carried, targets: TargetSet, view: int, adam: Adam, rigidity: float) -> None:
-        """Draw a view, compare, and move the joints."""
-        group, index = targets[view]
+    def _step(self, carried: _Carried, group: ViewTargets, index: int, adam: Adam, rigidity: float) -> None:
+        """Draw the view that was selected, compare, and move the joints."""
         carried.carry(self._rotations, self._positions)
-        group.select(index)
         group.rasterizer.redraw()
         group.add_losses(index, self._options.weights, values=False)
         drawn = group.rasterizer.backward()

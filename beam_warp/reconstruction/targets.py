@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -160,6 +160,12 @@ class ViewTargets:
             self.height * self.width if view.alpha is None else int((view.alpha > 0.5).sum()) for view in views
         ]
         self._depth_normals = [DepthNormals(camera, device=self.device) for camera in cameras]
+        # What a view is compared with lies where the one before was, so that a recorded step fits all of one kind.
+        self._target, self._geometry = wp.empty_like(self._colors[0]), DepthNormals(cameras[0], device=self.device)
+        self._target_alpha, self._doubt = (
+            next((wp.empty_like(it) for it in arrays if it is not None), None)
+            for arrays in (self._alphas, self._doubts)
+        )
         size, fine = (self.height, self.width), (cameras[0].height, cameras[0].width)
         images, adjoints = self.rasterizer.images, self.rasterizer.adjoints()
         colors, normals = self.rasterizer.color_channels.start, self.rasterizer.normal_channels.start
@@ -183,11 +189,23 @@ class ViewTargets:
         self._sums = SumBuffers(self.device)
 
     def select(self, index: int) -> None:
-        """Look from a view; may be captured in a CUDA graph."""
+        """Look from a view, and bring what it is compared with to where `add_losses` finds it; waits for nothing."""
         self.rasterizer.set_cameras(self._cameras[index])
+        self._geometry.look_as(self._depth_normals[index])
+        for place, kept in (
+            (self._target, self._colors[index]),
+            (self._target_alpha, self._alphas[index]),
+            (self._doubt, self._doubts[index]),
+        ):
+            if kept is not None:
+                wp.copy(place, kept)
+
+    def kind(self, index: int) -> Hashable:
+        """Return what views have in common that are compared by the same launches, when each was selected before."""
+        return self, self._alphas[index] is None, self._doubts[index] is None
 
     def move_camera(self, index: int, camera: Camera) -> None:
-        """Draw a view from another camera from now on, also where steps were recorded.
+        """Draw a view from another camera from now on.
 
         Normals of depth keep the camera that the view began with.
 
@@ -196,13 +214,11 @@ class ViewTargets:
             camera: Its camera, with the view's size.
         """
         fine = camera.supersampled(self.samples)
-        moved = self.rasterizer.prepare_cameras([fine])
-        wp.copy(self._cameras[index].views, moved.views)
-        self._cameras[index] = PreparedCameras(moved.cameras, moved.layout, self._cameras[index].views)
+        self._cameras[index] = self.rasterizer.prepare_cameras([fine])
         self.cameras = (*self.cameras[:index], fine, *self.cameras[index + 1 :])
 
     def add_losses(self, index: int, weights: LossWeights, *, values: bool = True) -> list[wp.array]:
-        """Compare what was drawn last with a view, and write the derivatives to the rasteriser's adjoints.
+        """Compare what was drawn last with the selected view, and write the derivatives to the rasteriser's adjoints.
 
         What is not known of a pixel is taken to be what was drawn.
 
@@ -213,7 +229,7 @@ class ViewTargets:
         self._adjoints.zero_()
         self._to_encoded.zero_()
         launch_average(self._color, self.samples, True, self._encoded, self.device)
-        target, doubt = self._colors[index], self._doubts[index]
+        target, doubt = self._target, None if self._doubts[index] is None else self._doubt
         launch_believe(doubt, target, self._encoded, self.device)
         terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded, value=values)]
         if weights.ssim > 0.0:
@@ -222,7 +238,7 @@ class ViewTargets:
             )
         launch_believe(doubt, None, self._to_encoded, self.device)
         launch_add_sample_gradients(self._color, self.samples, True, self._to_encoded, self._to_color, self.device)
-        alpha = self._alphas[index]
+        alpha = None if self._alphas[index] is None else self._target_alpha
         if alpha is not None and weights.alpha > 0.0:
             self._to_covered.zero_()
             launch_average(self._alpha, self.samples, False, self._covered, self.device)
@@ -234,8 +250,7 @@ class ViewTargets:
             launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
         if weights.normal > 0.0:
             self._to_surface.zero_()
-            geometry = self._depth_normals[index]
-            geometry.write(self._depth, self._coverage, self._surface)
+            self._geometry.write(self._depth, self._coverage, self._surface)
             terms.append(
                 self._agreement(
                     self._normal,
@@ -248,7 +263,7 @@ class ViewTargets:
                     value=values,
                 )
             )
-            geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
+            self._geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
         return terms
 
     def shares(self, index: int, gaussians: GaussianArrays) -> NDArray[np.float32]:
