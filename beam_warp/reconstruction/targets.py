@@ -16,6 +16,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_number
 from beam_warp.device.array_checks import pixel_channels
 from beam_warp.device.arrays import upload
+from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidOptionError
 from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
@@ -144,10 +145,12 @@ class ViewTargets:
         cameras = tuple(view.camera.supersampled(samples) for view in views)
         self.cameras = cameras
         self._weigher: Rasterizer | None = None
+        self._drawn: GaussianArrays | None = None
         self.rasterizer = Rasterizer(
             gaussian_count, cameras[:1], radiance=True, normals=True, options=options, device=device
         )
         self.device = self.rasterizer.device
+        self._looks = StepGraphs(self.device)
         self.height, self.width = views[0].camera.height, views[0].camera.width
         self.samples = samples
         self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
@@ -284,21 +287,43 @@ class ViewTargets:
         return values.numpy()[:, 0] / np.float32(self.samples**2)
 
     def psnr(self, index: int) -> float:
-        """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB].
+        """Return the PSNR of what was drawn last against a view, see `decibels`; waits for the device."""
+        self.write_error(index, self._error)
+        return self.decibels(index, float(self._error.numpy()[0]))
+
+    def write_error(self, index: int, out: wp.array) -> None:
+        """Write the mean square error of what was drawn last against a view to ``out[0]``, encoded and clipped."""
+        launch_average(self._color, self.samples, True, self._encoded, self.device)
+        launch_square_error(self._errors.size, self._encoded, self._colors[index], self._errors, self.device)
+        launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, out, self.device)
+
+    def decibels(self, index: int, error: float) -> float:
+        """Return the PSNR of a mean square error of colours in [0, 1] [dB].
 
         NaN for a view that shows nothing of the subject: black is easily met, and says nothing.
         """
         if self._alphas[index] is not None and not self._subjects[index]:
             return math.nan
-        launch_average(self._color, self.samples, True, self._encoded, self.device)
-        launch_square_error(self._errors.size, self._encoded, self._colors[index], self._errors, self.device)
-        launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
-        return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
+        return -10.0 * math.log10(max(error, 1e-12))
 
     def draw(self, index: int, gaussians: GaussianArrays) -> None:
         """Draw Gaussians for a view, with as much room as they take."""
         self.select(index)
+        self._looks.clear()
         self.rasterizer.draw(gaussians)
+        self._drawn = gaussians
+
+    def look(self, index: int, gaussians: GaussianArrays) -> None:
+        """Draw Gaussians for a view; waits for nothing, and makes no room, if the same arrays were drawn before."""
+        if not self.has_drawn(gaussians):
+            self.draw(index, gaussians)
+            return
+        self.select(index)
+        self._looks.run("redraw", self.rasterizer.redraw)
+
+    def has_drawn(self, gaussians: GaussianArrays) -> bool:
+        """Tell whether these arrays were drawn last."""
+        return self._drawn is gaussians
 
     def compared(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return what was drawn last and a view with coverage, encoded, ``(H, W, 4)`` each, and depth ``(H, W)`` [m].
@@ -357,6 +382,8 @@ class TargetSet:
             by_size.setdefault((view.camera.width, view.camera.height), []).append(number)
         self.device = device
         self._places: list[tuple[ViewTargets, int]] = [None] * len(cropped)  # type: ignore[list-item]
+        self._errors = wp.zeros(len(cropped), dtype=float, device=device)
+        self._pairs = wp.zeros(len(cropped), dtype=int, device=device)
         self._groups = []
         for numbers in by_size.values():
             group = ViewTargets([cropped[number] for number in numbers], gaussian_count, options, samples, device)
@@ -379,14 +406,27 @@ class TargetSet:
             PSNR of each crop, encoded and clipped to [0, 1] [dB], NaN where nothing of the subject is, ``(V,)``; and
             whether room had to be made: then what was recorded with the old arrays must be recorded again.
         """
-        before = [group.rasterizer.pair_capacity for group in self._groups]
-        psnr = []
-        for group, index in self._places:
+        before, are_others = self._rooms(), not all(group.has_drawn(gaussians) for group in self._groups)
+        room = []
+        for number, (group, index) in enumerate(self._places):
+            group.look(index, gaussians)
+            group.write_error(index, self._errors[number : number + 1])
+            group.rasterizer.note_pair_count(self._pairs, number)
+            room.append(group.rasterizer.pair_capacity)
+        for number in np.flatnonzero(self._pairs.numpy() > room):
+            group, index = self._places[number]
             group.draw(index, gaussians)
-            psnr.append(group.psnr(index))
-        for group in self._groups:
-            group.rasterizer.backward()  # allocates what the way back needs, which a recording must not
-        return np.array(psnr), before != [group.rasterizer.pair_capacity for group in self._groups]
+            group.write_error(index, self._errors[number : number + 1])
+        is_new = before != self._rooms()
+        if is_new or are_others:
+            for group in self._groups:
+                group.rasterizer.backward()  # allocates what the way back needs, which a recording must not
+        errors = self._errors.numpy()
+        psnr = [group.decibels(index, float(errors[k])) for k, (group, index) in enumerate(self._places)]
+        return np.array(psnr), is_new
+
+    def _rooms(self) -> list[int]:
+        return [group.rasterizer.pair_capacity for group in self._groups]
 
     def shares(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
         """Return what each Gaussian shows of itself over all views: its weights summed over pixels, ``(N,)``."""
@@ -409,10 +449,10 @@ class TargetSet:
         return total
 
     def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
-        """Draw every view, and return the largest gap in each, ``(V,)``; see `ViewTargets.gap`."""
+        """Draw every view, after `make_room`, and return the largest gap in each, ``(V,)``; see `ViewTargets.gap`."""
         gaps = []
         for group, index in self._places:
-            group.draw(index, gaussians)
+            group.look(index, gaussians)
             gaps.append(group.gap(index))
         return np.array(gaps)
 

@@ -327,7 +327,10 @@ def test_room_is_made_when_more_is_drawn(device):
     assert not targets.make_room(parameters.drawn)[1]
     parameters.set_rows({"log_scales": parameters.rows()["log_scales"] + np.float32(1.5)})
     parameters.activate()
-    assert targets.make_room(parameters.drawn)[1]
+    psnr, is_new = targets.make_room(parameters.drawn)
+    assert is_new
+    fresh = TargetSet(ball_views(rig(2)), 60, RASTER, 1, targets.device)
+    np.testing.assert_array_equal(psnr, fresh.make_room(parameters.drawn)[0])  # nothing was left out for lack of room
 
 
 class TestSampleSide:
