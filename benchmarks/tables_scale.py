@@ -45,16 +45,23 @@ def asset_gigabytes(result: Row) -> float:
     return result["takes"]["frames"] * result["constants"]["written"]["bytes"] / 1e9
 
 
-@table("scale_kills", "kills_real_cpu.json", "kills_processes_cpu.json", "kills_cluster_cpu.json")
-def kills(real: Row, processes: Row, cluster: Row) -> Rows:
+@table("scale_kills", "kills_real_cpu.json", "kills_real_h200.json", "kills_real_cluster_cpu.json")
+def kills(on_cpu: Row, on_gpu: Row, cluster: Row) -> Rows:
     """Return how many were killed in takes of 20 frames that are whole, and what that cost."""
-    rows: list[list[Any]] = [["", "steps", "killed are", "kills", "takes", "executions of a step"]]
-    for name, steps, who, found in (
-        ("three processes", "real ones, small", "processes, their server, drivers", real["processes"]),
-        ("three processes", "naps", "processes, drivers", processes["processes"]),
-        ("Ray cluster of three machines", "naps", "actors, machines, drivers", cluster["cluster"]),
+    kinds = {
+        "worker": ("worker",),
+        "server": ("server",),
+        "raylet": ("raylet",),
+        "driver": ("driver", "driver at the end"),
+    }
+    rows: list[list[Any]] = [["", "kills", *(f"of a {kind}" for kind in kinds), "takes", "executions of a step"]]
+    for name, found in (
+        ("three processes, two CPU cores", on_cpu["processes"]),
+        ("three processes, one H200", on_gpu["processes"]),
+        ("Ray cluster of three machines, two CPU cores", cluster["cluster"]),
     ):
-        rows.append([name, steps, who, found["kills"], found["takes"], f"{found['executions'] / found['steps']:.2f}"])
+        counts = [sum(found["killed"].get(name, 0) for name in names) or "" for names in kinds.values()]
+        rows.append([name, found["kills"], *counts, found["takes"], f"{found['executions'] / found['steps']:.2f}"])
     return rows
 
 
