@@ -409,4 +409,5 @@ def write_png(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> None:
             "Encode linear values with display_image."
         )
     with replacing(path) as temporary:
-        PillowImage.fromarray(np.ascontiguousarray(array)).save(temporary, format="PNG")
+        # Higher levels take far longer, and save little of what renders are.
+        PillowImage.fromarray(np.ascontiguousarray(array)).save(temporary, format="PNG", compress_level=3)
