@@ -18,11 +18,11 @@ def takes(result: Row) -> Rows:
         head,
         *(
             [
-                f"{row['workers']:,}",
+                f"{row['gpus']:,}",
                 row["segment"],
                 cell(row["hours"], ".1f"),
                 f"{row['efficiency']:.0%}",
-                cell(row["frames_per_hour_a_worker"], ".0f"),
+                cell(row["frames_per_hour_a_gpu"], ".0f"),
                 f"{cell(row['hours_written_by_one'], '.1f')} h, {row['efficiency_written_by_one']:.0%}",
             ]
             for row in result["takes"]["rows"]
@@ -65,20 +65,30 @@ def kills(on_cpu: Row, on_gpu: Row, cluster: Row) -> Rows:
     return rows
 
 
+@table("scale_workers_shared", "workers_h200.json")
 @table("scale_workers", "workers_h200x2.json")
 def workers(result: Row) -> Rows:
-    """Return what a take costs one process and one on each GPU, and how long each kind of step takes."""
-    kinds = ("frame", "materials", "preview")
+    """Return what a take costs processes on GPUs, and how long each kind of step takes."""
+    kinds = {"key frame": "key frame", "frame": "tracked frame", "materials": "materials", "preview": "preview"}
     rows: list[list[Any]] = [
-        ["GPUs", "seconds of steps", "busy", "frames an hour a GPU", "efficiency", *(f"{kind} [s]" for kind in kinds)]
+        [
+            "GPUs",
+            "processes",
+            "seconds of steps",
+            "busy",
+            "frames an hour a GPU",
+            "efficiency",
+            *(f"{kind} [s]" for kind in kinds.values()),
+        ]
     ]
     for row in result["take"]["rows"]:
         rows.append(
             [
+                row["gpus"],
                 row["workers"],
                 cell(row["working"], ".1f"),
                 f"{row['busy']:.0%}",
-                cell(row["frames_per_hour_a_worker"], ".0f"),
+                cell(row["frames_per_hour_a_gpu"], ".0f"),
                 f"{row.get('efficiency', 1.0):.0%}",
                 *(cell(row["steps"][kind]["median"], ".1f") for kind in kinds),
             ]
