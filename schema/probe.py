@@ -10,7 +10,7 @@ import json
 import sys
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdUtils, Work
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
@@ -91,11 +91,15 @@ def _touch(prim: Usd.Prim) -> None:
 
 
 def limit_memory(path: Path) -> None:
-    """Bound the memory of this process by the size of an asset's files, where the platform can."""
+    """Bound the memory of this process by the size of an asset's files, where the platform can.
+
+    OpenUSD works in one thread then: each has memory of its own, and many cores would leave none for files.
+    """
     try:
         import resource
     except ImportError:  # Windows has no such limit
         return
+    Work.SetConcurrencyLimit(1)
     limit = MEMORY + 4 * size_around(path)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
