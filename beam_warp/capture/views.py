@@ -61,6 +61,11 @@ class CapturedView:
             return (0, 0), (0, 0)
         return (int(columns[0]), int(rows[0])), (int(columns[-1]) + 1, int(rows[-1]) + 1)
 
+    @cached_property
+    def covered(self) -> float:
+        """How many pixels the subject covers; all of the image where that is not known."""
+        return float(self.camera.width * self.camera.height if self.alpha is None else self.alpha.sum())
+
     def cropped(self, left: int, top: int, width: int, height: int) -> CapturedView:
         """Return a part of the view with its camera.
 

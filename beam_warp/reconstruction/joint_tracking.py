@@ -24,7 +24,7 @@ from beam_warp.reconstruction.fit import mean_psnr
 from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
-from beam_warp.reconstruction.targets import LossWeights, TargetSet, ViewTargets, crop_views, shuffled_views
+from beam_warp.reconstruction.targets import LossWeights, TargetSet, ViewTargets, shuffled_views
 from beam_warp.world.clusters import Clusters
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -153,21 +153,17 @@ class JointTracker:
         chosen, begun = self._options, next(iter(starts))
         self._pose(starts[begun])
         rng = np.random.default_rng(seed)
-        seen = [
-            crop_views(views, [min(level, view.camera.width, view.camera.height) for view in views])
-            for level in chosen.levels
-        ]
+        factors = [[min(level, view.camera.width, view.camera.height) for view in views] for level in chosen.levels]
         with ThreadPoolExecutor(1) as ahead:  # while joints are moved at one level, what the next one draws is merged
-            labels = [self._labels(level, reduced) for level, reduced in zip(chosen.levels, seen, strict=True)]
+            labels = [self._labels(views, reductions) for reductions in factors]
             merged = [None if label is None else ahead.submit(self._merged, label) for label in labels]
             for index, (level, iterations) in enumerate(zip(chosen.levels, chosen.iterations, strict=True)):
                 clusters = merged[index]
                 carried = self._all if clusters is None else self._on_joints(*clusters.result())
                 targets = whole if level == 1 else None
                 if targets is None:
-                    targets = TargetSet(
-                        seen[index], carried.count, self._raster, samples if level == 1 else 1, self.device
-                    )
+                    side = samples if level == 1 else 1
+                    targets = TargetSet(views, carried.count, self._raster, side, self.device, factors[index])
                 if index == 0 and len(starts) > 1:
                     likeness = {name: self._likeness(carried, targets, start) for name, start in starts.items()}
                     begun = max(likeness, key=likeness.__getitem__)
@@ -219,14 +215,16 @@ class JointTracker:
         positions = self._all.drawn.positions.numpy().copy()  # on the CPU it is the array
         return cloud.with_arrays(positions=positions, orientations=orientations.astype(np.float32))
 
-    def _labels(self, level: int, views: Sequence[CapturedView]) -> NDArray[np.int64] | None:
+    def _labels(self, views: Sequence[CapturedView], reductions: Sequence[int]) -> NDArray[np.int64] | None:
         """Return what merges for reduced views, so that no more than `GAUSSIANS_PER_PIXEL` are drawn; None for nothing.
 
         Nothing merges at full resolution, and where coverage is not known.
         """
-        pixels = float(np.mean([np.inf if view.alpha is None else view.alpha.sum() for view in views]))
+        if max(reductions) == 1 or any(view.alpha is None for view in views):
+            return None
+        pixels = float(np.mean([view.covered / factor**2 for view, factor in zip(views, reductions, strict=True)]))
         size = int(len(self._cloud) / max(2 * GAUSSIANS_PER_PIXEL * pixels, 1.0))
-        return None if level == 1 or size < 2 else hanging_together(self._cloud, self._anchors, size, self.device)
+        return None if size < 2 else hanging_together(self._cloud, self._anchors, size, self.device)
 
     def _merged(self, labels: NDArray[np.int64]) -> tuple[GaussianCloud, Anchors]:
         """Return the Gaussians that clusters are, and what carries each."""

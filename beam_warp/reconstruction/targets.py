@@ -373,11 +373,17 @@ class TargetSet:
     """
 
     def __init__(
-        self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, samples: int, device: Any
+        self,
+        views: Sequence[CapturedView],
+        gaussian_count: int,
+        options: RasterOptions,
+        samples: int,
+        device: Any,
+        reductions: Sequence[int] | None = None,
     ) -> None:
-        """Crop views to the subject and bring them to a device; see `ViewTargets`."""
+        """Crop views to the subject, reduce them and bring them to a device; see `ViewTargets` and `crop_views`."""
         by_size: dict[tuple[int, int], list[int]] = {}
-        cropped = crop_views(views)
+        cropped = crop_views(views, reductions)
         for number, view in enumerate(cropped):
             by_size.setdefault((view.camera.width, view.camera.height), []).append(number)
         self.device = device
