@@ -111,6 +111,13 @@ def start(result: Row) -> Rows:
     ]
 
 
+@table("scale_capture", "capture_h200.json")
+def capture(result: Row) -> Rows:
+    """Return how long a capture takes in all, by workers on one GPU."""
+    rows: list[list[Any]] = [["workers", "all [s]"]]
+    return [*rows, *([row["name"], cell(row["whole"], ".1f")] for row in result["capture"]["rows"])]
+
+
 @table("scale_memory_receipts", "memory_cpu.json")
 @table("scale_memory", "memory_h200.json")
 def memory(result: Row) -> Rows:

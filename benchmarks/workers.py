@@ -2,7 +2,8 @@
 
     python benchmarks/workers.py [--quick] [--parts PART] [--frames N --segment-length N] [--workers WORD ...] --out R
 
-``start``: how long a tiny take needs until its first step begins, and in all, kernels compiled before. ``take``:
+``start``: how long a tiny take needs until its first step begins, and in all, kernels compiled before. ``capture``: how
+long the capture walker takes in all, six frames of 24 views of 320 pixels, all options as they are. ``take``:
 The take shows a few moments of `beam_warp.demo.capture` over and over. A first run of few small views compiles kernels.
 For each way of working: the seconds of each kind of step; the time before the first one, from the first one to the end
 of the last, and after it; frames an hour of one GPU, and the efficiency of GPUs against the first way, both by the time
@@ -43,7 +44,9 @@ from beam_warp.plan.steps import Rank
 Row = dict[str, Any]
 
 BEAM = (sys.executable, "-P", "-c", "from beam_warp.cli.entry import beam; raise SystemExit(beam())")
-STARTS = 5
+STARTS, RUNS = 5, 2
+"""How often tiny takes, and a capture, are run."""
+
 KEPT = ("--cameras", "keep", "--masks", "keep", "--exposures", "keep", "--quiet")
 
 
@@ -75,6 +78,7 @@ class Bench:
     gaussians: int = 140_000
     more: tuple[str, ...] = ()
     place: Path = field(default_factory=Path)
+    data: Path = field(default_factory=Path)
 
     def capture(self, name: str, cameras: int, width: int, height: int, frames: int) -> Path:
         """Path trace a capture, and name its moments over and over."""
@@ -171,12 +175,30 @@ def start(bench: Bench) -> Iterator[Row]:
         yield {"rows": rows}
 
 
-PARTS = {"start": start, "take": take}
+def capture(bench: Bench) -> Iterator[Row]:
+    """Run the command on a capture as it is, in each way, after a run that compiles."""
+    folder, rows = bench.data / "captures" / "walker", list[Row]()
+
+    def seconds(workers: str) -> float:
+        began = time.perf_counter()
+        out = bench.place / "walker"
+        subprocess.run([*BEAM, "run", str(folder), "--workers", workers, "--out", str(out), "--quiet"], check=True)
+        shutil.rmtree(out)
+        return time.perf_counter() - began
+
+    seconds(bench.workers[0])
+    for workers in bench.workers:
+        rows.append({"name": workers, "whole": spread(np.array([seconds(workers) for _ in range(RUNS)]))})
+        say(json.dumps(rows[-1]))
+        yield {"rows": rows}
+
+
+PARTS = {"start": start, "take": take, "capture": capture}
 
 
 def main() -> None:
     """Measure, and write the result after every run."""
-    parser = record.parser(__doc__, quick="small images, to see whether it runs", parts=PARTS)
+    parser = record.parser(__doc__, data=True, quick="small images, to see whether it runs", parts=PARTS)
     parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--segment-length", type=int, default=3)
     parser.add_argument("--seam-frames", type=int, default=0)
@@ -190,7 +212,7 @@ def main() -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     keep = functools.partial(record.write_result, arguments, resolve_device(None))
     with tempfile.TemporaryDirectory() as name:
-        bench.place = Path(name)
+        bench.place, bench.data = Path(name), arguments.data
         measure(PARTS, bench, only=arguments.parts, keep=keep)
 
 
