@@ -47,6 +47,9 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 Row = dict[str, Any]
 
 WORKED = "workers_h200.json"
+MEASURED = {"key_frame": "key frame", "tracked_frame": "frame", "materials": "materials", "preview": "preview"}
+"""Kinds of steps in that result, by the names that they have here."""
+
 ASSETS = ("gaussians", "asset")
 """Assets that a take becomes: what was reconstructed, and what can be relit. Both are charged as the larger one."""
 
@@ -138,7 +141,7 @@ def constants(bench: Bench) -> Iterator[Row]:
     """Seconds a step, by stage; of a key frame and a tracked one."""
     known = json.loads((record.RESULTS / WORKED).read_text(encoding="utf-8"))
     best = max(known["take"]["rows"], key=lambda row: row["frames_per_hour_a_gpu"])
-    seconds = {stage: best["steps"][stage]["median"] for stage in ("key frame", "frame", "materials", "preview")}
+    seconds = {name: best["steps"][kind]["median"] for name, kind in MEASURED.items()}
     yield {
         "processes": best["workers"] // best["gpus"],
         "seconds": seconds,
@@ -178,8 +181,8 @@ def takes(bench: Bench) -> Iterator[Row]:
     written, measured = known["written"], known["seconds"]
     survey, clip = (CLIP_FRAMES * written[name] for name in ("survey", "clip"))
     seconds = {
-        "key_frame": measured["key frame"],
-        **dict.fromkeys(("frame", "seam"), measured["frame"]),
+        "key_frame": measured["key_frame"],
+        **dict.fromkeys(("frame", "seam"), measured["tracked_frame"]),
         "materials": measured["materials"],
         "faded_materials": FADED * measured["materials"],
         "light": 0.0,

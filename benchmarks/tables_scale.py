@@ -82,13 +82,15 @@ def workers(result: Row) -> Rows:
         ]
     ]
     for row in result["take"]["rows"]:
+        row = {"gpus": row["workers"], **row}
+        row["steps"] = {"key frame": row["steps"]["frame"], **row["steps"]}
         rows.append(
             [
                 row["gpus"],
                 row["workers"],
                 cell(row["working"], ".1f"),
                 f"{row['busy']:.0%}",
-                cell(row["frames_per_hour_a_gpu"], ".0f"),
+                cell(row.get("frames_per_hour_a_gpu") or row["frames_per_hour_a_worker"], ".0f"),
                 f"{row.get('efficiency', 1.0):.0%}",
                 *(cell(row["steps"][kind]["median"], ".1f") for kind in kinds),
             ]
@@ -109,13 +111,6 @@ def start(result: Row) -> Rows:
         ["workers", *parts.values()],
         *([row["workers"], *(cell(row[name], ".1f") for name in parts)] for row in result["start"]["rows"]),
     ]
-
-
-@table("scale_capture", "capture_h200.json")
-def capture(result: Row) -> Rows:
-    """Return how long a capture takes in all, by workers on one GPU."""
-    rows: list[list[Any]] = [["workers", "all [s]"]]
-    return [*rows, *([row["name"], cell(row["whole"], ".1f")] for row in result["capture"]["rows"])]
 
 
 @table("scale_memory_receipts", "memory_cpu.json")
