@@ -106,7 +106,8 @@ class Bench:
         receipts = standing.receipts.values()
         first = min(receipt.ended - receipt.seconds for receipt in receipts)
         last = max(receipt.ended for receipt in receipts)
-        count = len(visible_gpus()) if workers == "gpus" else int(workers)
+        each, _, place = workers.rpartition("@")
+        count = int(each or 1) * len(visible_gpus()) if place == "gpus" else int(workers)
         gpus = max(min(count, len(visible_gpus())), 1)
         times = dict[str, list[float]]()
         for step in standing.steps:
