@@ -7,6 +7,7 @@ its parent treats as an error too.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -20,6 +21,10 @@ from beam_warp.schema.stage_queries import clip_sets, splat_prims
 
 MEMORY = 2**30
 """Memory for OpenUSD itself [byte], of which it takes a tenth; a corrupt length that asks for more fails instead."""
+
+
+THREAD = 2**23
+"""Memory for the stack of each thread that OpenUSD starts, one a core [byte]."""
 
 
 def fault(path: Path) -> str | None:
@@ -91,12 +96,18 @@ def _touch(prim: Usd.Prim) -> None:
 
 
 def limit_memory(path: Path) -> None:
-    """Bound the memory of this process by the size of an asset's files, where the platform can."""
+    """Bound the memory that this process takes from now on by the size of an asset's files, where the platform can.
+
+    What it holds already is not the asset's: libraries take 40 MB for each core of the machine.
+    """
     try:
         import resource
     except ImportError:  # Windows has no such limit
         return
-    limit = MEMORY + 4 * size_around(path)
+    held = Path("/proc/self/statm")  # of Linux, where the limit counts all that is private and writable
+    pages = int(held.read_text().split()[5]) if held.is_file() else 0
+    stacks = (os.cpu_count() or 1) * THREAD
+    limit = pages * resource.getpagesize() + stacks + MEMORY + 4 * size_around(path)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
