@@ -43,8 +43,17 @@ class Reduce:
     max_flip: Annotated[float | None, arg(metavar="X", help="Most FLIP against the original, in 19 of 20 draws.")] = (
         None
     )
+    target_error: Annotated[
+        float | None, arg(metavar="E", help="Most RMS error of display values against the original, in 19 of 20 draws.")
+    ] = None
     size: Annotated[str | None, arg(metavar="BYTES", help="Most bytes of the file, such as 20MB.")] = None
     gaussians: Annotated[int | None, arg(metavar="N", help="Number of Gaussians.")] = None
+    target_fps: Annotated[
+        float | None, arg(metavar="F", help="As many Gaussians as this device draws so often a second.")
+    ] = None
+    target_seconds: Annotated[
+        float | None, arg(metavar="S", help="With --gaussians: refit for as long as this whole call may take.")
+    ] = None
     asset_psnr: Annotated[
         float, arg(metavar="DB", help="What the asset's relit images have against the truth, as beam evaluate says.")
     ] = 35.0
@@ -71,22 +80,26 @@ def reduce(args: Reduce) -> int:
     from beam_warp.world.environment import EnvironmentMap
 
     sequence = args.reading.read(args.asset)
+    environments = [EnvironmentMap.read(path) for path in args.environment] or [*demo_environments().values()]
+    left = None if args.target_seconds is None else max(args.target_seconds - time.perf_counter() + started, 1e-6)
     options = ReduceOptions(
         max_loss=args.max_loss,
         max_flip=args.max_flip,
+        target_error=args.target_error,
         size=None if args.size is None else bytes_of(args.size),
         gaussians=args.gaussians,
+        target_fps=args.target_fps,
         asset_psnr=args.asset_psnr,
         height=args.height,
         pairs=args.pairs,
         confidence=args.confidence,
         views=args.views,
         steps=args.steps,
+        target_seconds=left,
         seed=args.seed,
         raster=args.reading.raster(sequence),
         device=args.device,
     )
-    environments = [EnvironmentMap.read(path) for path in args.environment] or [*demo_environments().values()]
     with progress(args.quiet or args.json) as report:
         found = reduce_asset(sequence, environments, options, args.out, progress=report)
     seconds = time.perf_counter() - started
@@ -96,6 +109,12 @@ def reduce(args: Reduce) -> int:
         print_notes(notes_of(sequence))
         print(f"{found.count:,} of {found.original_count:,} Gaussians in {args.out}, {seconds:.1f} s")
         print(f"certified: {found.certificate}")
+        if found.fps is not None:
+            met = "met" if found.fps >= (args.target_fps or 0.0) else "MISSED"
+            print(f"target {met}: fps {args.target_fps:g}, reached {found.fps:.3g} at {args.height} pixels")
+        if args.target_seconds is not None:
+            met = "met" if seconds <= args.target_seconds else "MISSED"
+            print(f"target {met}: seconds {args.target_seconds:g}, reached {seconds:.3g}")
     return 0
 
 
@@ -118,6 +137,7 @@ def _facts(found: Reduction) -> dict[str, object]:
         "original": found.original_count,
         "bytes": sum(path.stat().st_size for path in found.paths),
         "error_scale": found.error_scale,
+        "fps": found.fps,
         "candidates": [{"gaussians": count, "error": error} for count, error in found.candidates],
         "certificate": asdict(found.certificate),
     }

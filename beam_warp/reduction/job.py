@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reduction.changes import changed
 from beam_warp.reduction.merging import MergeOrder
+from beam_warp.reduction.pilot import fast_enough, images_a_second, steps_within
 from beam_warp.reduction.refit import refit
 from beam_warp.reduction.sensitivity import Sensitivity, measure_sensitivity
 from beam_warp.world.clusters import Clusters
@@ -62,7 +64,12 @@ STEEPNESS = 1.1
 """Errors fall about with this power of the number of Gaussians, between 5 % and 50 % of them."""
 
 
-TARGETS = ("max_loss", "max_flip", "size", "gaussians")
+DRAWN = 8
+"""Draws of the search by which the time of an image is told."""
+
+TARGETS = ("max_loss", "max_flip", "target_error", "size", "gaussians", "target_fps")
+BOUNDS = {"max_loss": "loss", "max_flip": "flip", "target_error": "error"}
+"""Targets that bound an error, and its measure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,14 +79,17 @@ class ReduceOptions:
     Attributes:
         max_loss: Most loss against the truth by errors of the reduction [dB], see `beam_warp.evaluate.relit.loss_of`.
         max_flip: Most mean FLIP against the original, in (0, 1].
+        target_error: Largest root mean square error of display values against the original, in (0, 1].
         size: Most bytes of what is written.
         gaussians: Number of Gaussians.
+        target_fps: As many Gaussians as this device draws so often a second, under lights and cameras that change.
         asset_psnr: PSNR of the asset's relit images against the truth [dB], which ``max_loss`` is counted from.
         height: Side of the images that are compared [pixel]: the size at which the asset will be seen.
         pairs: Draws of a light, a camera and a frame that the certificate is made on.
         confidence: Of the certificate, in (0, 1).
         views: Views on which sensitivities are measured, and which are refitted.
         steps: Steps of a refit.
+        target_seconds: Longest time of the call [s], with ``gaussians``: refits take as many steps as it leaves.
         seed: Same seed, same device: same result.
         raster: How splats are drawn; as the asset states without.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
@@ -90,14 +100,17 @@ class ReduceOptions:
 
     max_loss: float | None = None
     max_flip: float | None = None
+    target_error: float | None = None
     size: int | None = None
     gaussians: int | None = None
+    target_fps: float | None = None
     asset_psnr: float = ASSET_PSNR
     height: int = 256
     pairs: int = 200
     confidence: float = 0.95
     views: int = 48
     steps: int = 600
+    target_seconds: float | None = None
     seed: int = 0
     raster: RasterOptions | None = None
     device: Any = None
@@ -107,14 +120,21 @@ class ReduceOptions:
         given = [name for name in TARGETS if getattr(self, name) is not None]
         if len(given) != 1:
             raise InvalidOptionError(
-                f"target must be one of max-loss, max-flip, size and gaussians, got {len(given)}. Give one of them."
+                f"target must be one of {', '.join(TARGETS).replace('_', '-')}, got {len(given)}. Give one of them."
             )
-        for name, most in (("max_loss", 60.0), ("max_flip", 1.0)):
+        for name, most in (("max_loss", 60.0), ("max_flip", 1.0), ("target_error", 1.0), ("target_fps", 1e6)):
             if getattr(self, name) is not None:
                 require_number(name, getattr(self, name), 1e-6, most)
         for name in ("size", "gaussians"):
             if getattr(self, name) is not None:
                 require_count(name, getattr(self, name), 1, 2**40)
+        if self.target_seconds is not None:
+            require_number("target_seconds", self.target_seconds, 1e-9, 1e9)
+            if self.gaussians is None:
+                raise InvalidOptionError(
+                    f"target-seconds must go with gaussians, got {self.target.replace('_', '-')}, whose search "
+                    "takes as long as it needs. Ask for a number of Gaussians."
+                )
         require_number("asset_psnr", self.asset_psnr, 5.0, 100.0)
         require_count("pairs", self.pairs, 2, MOST_PAIRS)
         require_number("confidence", self.confidence, 0.5, 0.9999)
@@ -129,7 +149,7 @@ class ReduceOptions:
     @property
     def measure(self) -> str:
         """Which error is bounded."""
-        return "flip" if self.max_flip is not None else "loss"
+        return BOUNDS.get(self.target, "loss")
 
     @property
     def target(self) -> str:
@@ -138,8 +158,8 @@ class ReduceOptions:
 
     @property
     def bound(self) -> float | None:
-        """The bound on the error; None if the target is a number of bytes or Gaussians."""
-        return self.max_loss if self.max_loss is not None else self.max_flip
+        """The bound on the error; None if the target is another one."""
+        return getattr(self, self.target) if self.target in BOUNDS else None
 
 
 def least_pairs(confidence: float) -> int:
@@ -163,6 +183,7 @@ class Reduction:
         original_count: Gaussians of the original.
         candidates: Numbers of Gaussians that were tried, and their errors on the search's half.
         error_scale: Factor of the bounds of delivery; None for other containers.
+        fps: Images a second that were drawn of what is written; None unless they were asked for.
     """
 
     count: int
@@ -171,6 +192,7 @@ class Reduction:
     original_count: int
     candidates: tuple[tuple[int, float], ...]
     error_scale: float | None
+    fps: float | None = None
 
 
 class Reducer:
@@ -273,6 +295,7 @@ def reduce_asset(
         raise InvalidOptionError(f"out must be a file of USD or b4d, got {out.name}. Only these hold a certificate.")
     if options.measure == "flip":
         require_flip()
+    started = time.perf_counter()
     reducer = Reducer(original, environments, options, progress)
     how = {"raster": reducer.raster, "measure": options.measure, "device": options.device}
     how["asset_psnr"] = options.asset_psnr
@@ -280,6 +303,9 @@ def reduce_asset(
     with tempfile.TemporaryDirectory(prefix="beam_reduce_") as folder:
         search = _Search(reducer, comparison, Path(folder) / f"stored{out.suffix}")
         count, scale = search.target()
+        if options.target_seconds is not None:
+            left, draws = options.target_seconds - (time.perf_counter() - started), TRIED + options.pairs
+            search.steps = steps_within(left, comparison, search.timed, search.candidate, count, draws)
         for attempt in range(TRIES):
             progress("certify", attempt, TRIES)
             stored = search.stored(count, scale)[0]
@@ -294,7 +320,8 @@ def reduce_asset(
             )
         final = replace(search.candidate(count), metadata={**original.metadata, **made.as_metadata()})
         paths = converters.write(final, out, _written_as(scale))
-    return Reduction(count, made, tuple(paths), len(reducer), tuple(search.tried), scale)
+        fps = None if options.target_fps is None else images_a_second(comparison, stored, search.timed)
+    return Reduction(count, made, tuple(paths), len(reducer), tuple(search.tried), scale, fps)
 
 
 def _certified(
@@ -328,18 +355,20 @@ class _Search:
 
     def __init__(self, reducer: Reducer, comparison: RelitComparison, place: Path) -> None:
         self._reducer, self._comparison, self._place, self._options = reducer, comparison, place, reducer.options
+        self.steps = reducer.options.steps
         self.tried: list[tuple[int, float]] = []
         self._stored = 0
         self._made: dict[tuple[int, int], GaussianSequence] = {}
         start = 3 * reducer.options.views
         self._draws = reducer.trials.draw("search", range(start, start + TRIED), range(len(reducer.original)))
+        self.timed = self._draws[:DRAWN]
         self._delivers = format_of(place).name == "b4d"
 
     def candidate(self, count: int, steps: int | None = None) -> GaussianSequence:
         """Return the reduced asset of a number of Gaussians, made once."""
-        key = count, self._options.steps if steps is None else steps
+        key = count, self.steps if steps is None else steps
         if key not in self._made:
-            self._made[key] = self._reducer.reduced(count, steps=steps)
+            self._made[key] = self._reducer.reduced(count, steps=key[1])
         return self._made[key]
 
     def error(self, sequence: GaussianSequence) -> float:
@@ -366,6 +395,9 @@ class _Search:
             return min(options.gaussians, len(self._reducer)), 1.0 if self._delivers else None
         if options.size is not None:
             return self._within_size(options.size)
+        if options.target_fps is not None:
+            how = (self._comparison, self.timed, self.candidate, len(self._reducer))
+            return fast_enough(options.target_fps, *how), 1.0 if self._delivers else None
         assert options.bound is not None
         if not self._delivers:
             return self._fewest(options.bound), None
