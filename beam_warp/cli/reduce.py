@@ -63,8 +63,10 @@ class Reduce:
     height: Annotated[int, arg(metavar="PX", help="Side of compared images: how large it will be seen.")] = 256
     pairs: Annotated[int, arg(metavar="N", help="Draws of light, camera and frame for the certificate.")] = 200
     confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate.")] = 0.95
-    views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 48
-    steps: Annotated[Annotated[int, arg(metavar="N", help="Steps of a refit.")], SECOND_PAGE] = 600
+    views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 144
+    steps: Annotated[
+        int | None, arg(metavar="N", help="Steps of a refit; by default 2880 on a GPU, 600 elsewhere."), SECOND_PAGE
+    ] = None
     reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
     seed: Seed = 0
     device: Device = None
