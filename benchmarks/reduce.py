@@ -233,8 +233,8 @@ def sizes(bench: Bench) -> Iterator[Row]:
             return said if truth is None else said | {"truth_loss": truth - (against_truth(name, one, bench) or 0.0)}
 
         cloud = change_axes(original[0], "rfu")
-        for share in bench.shares:
-            for contender, keep in CONTENDERS.items():
+        for contender, keep in CONTENDERS.items():
+            for share in bench.shares:
                 row: Row = {"name": f"{name} {share:g} {contender}", "asset": name, "share": share, "truth": truth}
                 row |= {"contender": contender, "original": len(cloud), "sensitivity_seconds": measured}
                 place = None if bench.made is None else bench.made / f"{name}_{share:g}.ply"
