@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -14,6 +15,7 @@ from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, ReadingFlags, Seed, notes_of
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
+from beam_warp.study.targets import Rung, Target, in_words, outcome
 
 if TYPE_CHECKING:
     from beam_warp.reduction.job import Reduction
@@ -83,7 +85,6 @@ def reduce(args: Reduce) -> int:
 
     sequence = args.reading.read(args.asset)
     environments = [EnvironmentMap.read(path) for path in args.environment] or [*demo_environments().values()]
-    left = None if args.target_seconds is None else max(args.target_seconds - time.perf_counter() + started, 1e-6)
     options = ReduceOptions(
         max_loss=args.max_loss,
         max_flip=args.max_flip,
@@ -97,7 +98,8 @@ def reduce(args: Reduce) -> int:
         confidence=args.confidence,
         views=args.views,
         steps=args.steps,
-        target_seconds=left,
+        target_seconds=args.target_seconds,
+        spent=time.perf_counter() - started,
         seed=args.seed,
         raster=args.reading.raster(sequence),
         device=args.device,
@@ -105,19 +107,27 @@ def reduce(args: Reduce) -> int:
     with progress(args.quiet or args.json) as report:
         found = reduce_asset(sequence, environments, options, args.out, progress=report)
     seconds = time.perf_counter() - started
+    target = _target(args, found, seconds)
     if args.json:
-        print_json({**_facts(found), "seconds": round(seconds, 3), "notes": notes_of(sequence)})
+        said = {"target": target} if target else {}
+        print_json({**_facts(found), "seconds": round(seconds, 3), "notes": notes_of(sequence), **said})
     elif not args.quiet:
         print_notes(notes_of(sequence))
         print(f"{found.count:,} of {found.original_count:,} Gaussians in {args.out}, {seconds:.1f} s")
         print(f"certified: {found.certificate}")
-        if found.fps is not None:
-            met = "met" if found.fps >= (args.target_fps or 0.0) else "MISSED"
-            print(f"target {met}: fps {args.target_fps:g}, reached {found.fps:.3g} at {args.height} pixels")
-        if args.target_seconds is not None:
-            met = "met" if seconds <= args.target_seconds else "MISSED"
-            print(f"target {met}: seconds {args.target_seconds:g}, reached {seconds:.3g}")
+        if target:
+            print(in_words(target))
     return 0
+
+
+def _target(args: Reduce, found: Reduction, seconds: float) -> dict[str, Any]:
+    """Return what is said of a target; empty if none was asked. An error is what the certificate bounds."""
+    asked = Target(error=args.target_error, seconds=args.target_seconds, fps=args.target_fps)
+    if not asked.asked():
+        return {}
+    chosen = Rung(settings={"gaussians": found.count, "steps": found.steps}, seconds=math.nan, frame_seconds=math.nan)
+    reached = {"error": found.certificate.bound, "seconds": seconds, "fps": found.fps}
+    return outcome(asked, chosen, reached if args.target_error is not None else {**reached, "error": None})
 
 
 def bytes_of(text: str) -> int:

@@ -94,6 +94,7 @@ class ReduceOptions:
         views: Views on which sensitivities are measured, and which are refitted: with few, these are learnt by heart.
         steps: Steps of a refit; None takes `GPU_STEPS` or `CPU_STEPS`.
         target_seconds: Longest time of the call [s], with ``gaussians``: refits take as many steps as it leaves.
+        spent: Part of that time that was spent before the call [s].
         seed: Same seed, same device: same result.
         raster: How splats are drawn; as the asset states without.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
@@ -115,6 +116,7 @@ class ReduceOptions:
     views: int = 144
     steps: int | None = None
     target_seconds: float | None = None
+    spent: float = 0.0
     seed: int = 0
     raster: RasterOptions | None = None
     device: Any = None
@@ -188,6 +190,7 @@ class Reduction:
         original_count: Gaussians of the original.
         candidates: Numbers of Gaussians that were tried, and their errors on the search's half.
         error_scale: Factor of the bounds of delivery; None for other containers.
+        steps: Steps of its refit.
         fps: Images a second that were drawn of what is written; None unless they were asked for.
     """
 
@@ -197,6 +200,7 @@ class Reduction:
     original_count: int
     candidates: tuple[tuple[int, float], ...]
     error_scale: float | None
+    steps: int
     fps: float | None = None
 
 
@@ -320,8 +324,9 @@ def reduce_asset(
         search = _Search(reducer, comparison, Path(folder) / f"stored{out.suffix}")
         count, scale = search.target()
         if options.target_seconds is not None:
-            left, draws = options.target_seconds - (time.perf_counter() - started), TRIED + options.pairs
-            search.steps = steps_within(left, comparison, search.timed, search.candidate, count, draws)
+            spent, draws = options.spent + time.perf_counter() - started, TRIED + options.pairs
+            how = (comparison, search.timed, search.candidate, count, draws)
+            search.steps = steps_within(options.target_seconds, spent, *how)
         for attempt in range(TRIES):
             progress("certify", attempt, TRIES)
             stored = search.stored(count, scale)[0]
@@ -337,7 +342,7 @@ def reduce_asset(
         final = replace(search.candidate(count), metadata={**original.metadata, **made.as_metadata()})
         paths = converters.write(final, out, _written_as(scale))
         fps = None if options.target_fps is None else images_a_second(comparison, stored, search.timed)
-    return Reduction(count, made, tuple(paths), len(reducer), tuple(search.tried), scale, fps)
+    return Reduction(count, made, tuple(paths), len(reducer), tuple(search.tried), scale, search.steps, fps)
 
 
 def _certified(

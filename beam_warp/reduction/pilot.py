@@ -60,12 +60,19 @@ def fast_enough(
 
 
 def steps_within(
-    seconds: float, comparison: RelitComparison, trials: Sequence[Trial], candidate: Candidate, count: int, draws: int
+    seconds: float,
+    spent: float,
+    comparison: RelitComparison,
+    trials: Sequence[Trial],
+    candidate: Candidate,
+    count: int,
+    draws: int,
 ) -> int:
     """Return how many steps of a refit fit into a time, in which draws are compared as well.
 
     Args:
-        seconds: What is left [s].
+        seconds: Longest time of the whole call [s].
+        spent: What has passed of it [s].
         comparison: Compares.
         trials: Some draws, by which their time is told.
         candidate: Makes reduced assets.
@@ -81,11 +88,12 @@ def steps_within(
         marks.append(time.perf_counter())
     step = max(marks[1] - marks[0], 1e-6) / PILOT_STEPS[1]
     drawing = draws * (comparison.seconds(made, trials) + comparison.seconds(comparison.original, trials))
-    spent = time.perf_counter() - began
+    spent += time.perf_counter() - began
     steps = (seconds - spent) / (TIME_MARGIN * step) - drawing / step
     if not steps >= 0.0:
+        nearest = np.ceil(10.0 * (spent + TIME_MARGIN * drawing)) / 10.0
         raise InvalidOptionError(
-            f"target-seconds must be attainable, got {spent + TIME_MARGIN * drawing - seconds:.3g} s too few. Allow "
-            "them, or compare fewer pairs."
+            f"target-seconds must be attainable, got {seconds:g}: the nearest is {nearest:g}, without a refit. Ask for "
+            "that, or compare fewer pairs."
         )
     return int(min(steps, MOST_STEPS))

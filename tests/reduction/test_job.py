@@ -209,11 +209,11 @@ def test_times_choose_gaussians_and_steps(few_draws, tmp_path, monkeypatch):
     assert fast.count == 300
     assert fast.fps is not None
     assert fast.fps > 1e-3
-    monkeypatch.setattr(job, "steps_within", lambda seconds, *_: 3 if seconds < 1e3 else 0)
+    monkeypatch.setattr(job, "steps_within", lambda seconds, spent, *_: 3 if spent > 7.0 else 0)
     steps = []
     monkeypatch.setattr(job, "refit", lambda *given, **how: steps.append(how["steps"]) or refit(*given, **how))
-    reduce_asset(ball(), LIGHTS, replace(QUICK, target_seconds=1e3), tmp_path / "timed.usda")
-    assert set(steps) == {3}
+    found = reduce_asset(ball(), LIGHTS, replace(QUICK, target_seconds=1e3, spent=7.0), tmp_path / "timed.usda")
+    assert set(steps) == {found.steps} == {3}
 
 
 @pytest.mark.parametrize(("text", "count"), [("20MB", 20_000_000), ("1.5 kb", 1500), ("7", 7)])

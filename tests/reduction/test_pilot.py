@@ -51,19 +51,20 @@ class TestSteps:
         return made
 
     def steps(self, clocked, seconds):
-        return steps_within(seconds, clocked, [], clocked.candidate, 20_000, 200)
+        return steps_within(seconds, 2.0, clocked, [], clocked.candidate, 20_000, 200)
 
     def test_they_fill_the_time_but_for_a_margin(self, clocked):
         steps = self.steps(clocked, 20.0)
         drawing = 200 * (clocked.seconds(20_000, []) + clocked.seconds(100_000, []))
-        assert clocked.now + TIME_MARGIN * (5e-3 * steps + drawing) == pytest.approx(20.0, abs=0.02)
+        assert 2.0 + clocked.now + TIME_MARGIN * (5e-3 * steps + drawing) == pytest.approx(20.0, abs=0.02)
 
     def test_more_than_bring_anything_are_not_taken(self, clocked):
         assert self.steps(clocked, 1e6) == MOST_STEPS
 
-    def test_a_time_without_room_is_refused_with_what_is_missing(self, clocked):
+    def test_a_time_without_room_is_refused_with_the_nearest_that_has_some(self, clocked):
         with pytest.raises(InvalidOptionError, match="target-seconds must be attainable") as refused:
             self.steps(clocked, 3.0)
-        missing = float(str(refused.value).split("got ")[1].split(" s")[0])
-        clocked.now = 0.0
-        assert self.steps(clocked, 3.01 + missing) >= 0
+        nearest = float(str(refused.value).split("nearest is ")[1].split(",")[0])
+        assert self.steps(clocked, nearest) >= 0
+        with pytest.raises(InvalidOptionError):
+            self.steps(clocked, nearest - 0.2)
