@@ -51,7 +51,7 @@ CASES: tuple[tuple[str, str, float], ...] = (
     ("run capture", "seconds", 150.0),
     ("reduce", "error", 0.05),
     ("reduce", "fps", 60.0),
-    ("reduce", "seconds", 40.0),
+    ("reduce", "seconds", 100.0),
 )
 """Commands, what is asked of them, and about which value; *run capture* goes all the way from photographs."""
 
