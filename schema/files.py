@@ -28,6 +28,9 @@ PROBE_SECONDS = 20.0
 PROBE_BYTES_PER_SECOND = 2e7
 """Rate at which a child process reads at least, beyond `PROBE_SECONDS`."""
 
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+"""Environment of child processes: each thread of BLAS takes memory of its own, of which a child may not have much."""
+
 MAX_PACKAGE_ENTRIES = 4096
 ZIP_ALIGNMENT = 64
 
@@ -124,7 +127,7 @@ def run_child(module: str, path: Path, seconds: float, *arguments: str) -> dict[
     ]  # a checkout in the working folder is not the package
     # The child finds this very package even where it was imported from a path that only this process knows.
     places = [place for place in sys.path if place]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
+    environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": os.pathsep.join(places)}
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=seconds, check=False, env=environment

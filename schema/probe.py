@@ -7,11 +7,10 @@ its parent treats as an error too.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdUtils, Work
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
@@ -21,10 +20,6 @@ from beam_warp.schema.stage_queries import clip_sets, splat_prims
 
 MEMORY = 2**30
 """Memory for OpenUSD itself [byte], of which it takes a tenth; a corrupt length that asks for more fails instead."""
-
-
-THREAD = 2**23
-"""Memory for the stack of each thread that OpenUSD starts, one a core [byte]."""
 
 
 def fault(path: Path) -> str | None:
@@ -96,18 +91,16 @@ def _touch(prim: Usd.Prim) -> None:
 
 
 def limit_memory(path: Path) -> None:
-    """Bound the memory that this process takes from now on by the size of an asset's files, where the platform can.
+    """Bound the memory of this process by the size of an asset's files, where the platform can.
 
-    What it holds already is not the asset's: libraries take 40 MB for each core of the machine.
+    OpenUSD works in one thread then: each has memory of its own, and many cores would leave none for files.
     """
     try:
         import resource
     except ImportError:  # Windows has no such limit
         return
-    held = Path("/proc/self/statm")  # of Linux, where the limit counts all that is private and writable
-    pages = int(held.read_text().split()[5]) if held.is_file() else 0
-    stacks = (os.cpu_count() or 1) * THREAD
-    limit = pages * resource.getpagesize() + stacks + MEMORY + 4 * size_around(path)
+    Work.SetConcurrencyLimit(1)
+    limit = MEMORY + 4 * size_around(path)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 

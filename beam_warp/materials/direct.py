@@ -146,6 +146,7 @@ def measure_materials(
         points.normals[at].contiguous(),
         sample_count=options.sample_count,
         offset=points.offsets[at].contiguous(),
+        options=points.tracing,
         sampler=options.sampler,
         seed=options.seed,
         # Occlusion and light are about as much work, so each is half of the way.

@@ -151,7 +151,7 @@ def light_evidence(scene: Scene, points: SurfacePoints, views: ViewEvidence, sub
     cells = cell_directions()
     point, cell = np.nonzero(normals @ cells.T > 0.0)
     openness = np.zeros((len(rows), len(cells)), np.float32)
-    openness[point, cell] = visibility(scene, origins[point].astype(np.float32), cells[cell])
+    openness[point, cell] = visibility(scene, origins[point].astype(np.float32), cells[cell], options=points.tracing)
     return LightEvidence(
         positions=points.positions.numpy()[rows],
         normals=normals,

@@ -47,7 +47,7 @@ from beam_warp.trace.incident import DENSITIES, Density, techniques
 from beam_warp.trace.rays import points_for_weights, ray_batches, room_for_rays
 from beam_warp.trace.sampling import SAMPLERS, Sampler, sample_set
 from beam_warp.trace.scene import Scene
-from beam_warp.trace.transmittance import EXACT, trace_rays
+from beam_warp.trace.transmittance import TraceOptions, trace_rays
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 
@@ -295,6 +295,7 @@ class LightPaths:
     positions: wp.array
     normals: wp.array
     offsets: wp.array
+    tracing: TraceOptions
     options: MaterialOptions
     frame: int
 
@@ -311,7 +312,7 @@ class LightPaths:
         """Collect what rays of the measured points need."""
         at = upload(measured.rows.astype(np.int32), int, scene.device)
         positions, offsets = points.positions[at].contiguous(), points.offsets[at].contiguous()
-        return cls(scene, light, positions, measured.surface.normals, offsets, options, frame)
+        return cls(scene, light, positions, measured.surface.normals, offsets, points.tracing, options, frame)
 
     def batches(self, count: int, rows: NDArray[np.integer[Any]]) -> list[RayBatch]:
         """Return batches of so many rays from some of the points."""
@@ -344,7 +345,7 @@ class LightPaths:
         for part in parts:
             part.known = 0 if pilot is None else pilot.samples.count
             launch_draw_light(part, self.light, cumulative, batch, rays, found.weights, device)
-        trace_rays(self.scene, EXACT, rays, found.visibility)
+        trace_rays(self.scene, self.tracing, rays, found.visibility)
         if pilot is not None:
             items = count * pilot.samples.count
             launch_recall_visibility(items, parts[0], pilot.samples, batch, *pilot[1:], found.visibility, device)
@@ -388,8 +389,9 @@ class LightPaths:
 
         def trace(batches: list[RayBatch]) -> None:
             counts, stream = upload(needed, int, device), (self.options.seed, self.frame)
+            settings = self.tracing.settings(self.scene)
             for batch in batches:
-                launch_trace_bounce(self.scene, EXACT.settings(self.scene), batch, radiance, stream, counts, out_light)
+                launch_trace_bounce(self.scene, settings, batch, radiance, stream, counts, out_light)
 
         batches = self.batches(first, rows)
         trace(batches)

@@ -10,18 +10,19 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from beam_warp.checks import require_number
 from beam_warp.device.arrays import upload
 from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.neighborhoods import (
     launch_consult_neighbors,
     launch_mean_of_face,
-    launch_reach_above,
     launch_thinnest_direction,
 )
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.scene import Scene
+from beam_warp.trace.transmittance import EXACT, FACING, TraceOptions
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.quaternions import rotation_matrices
 
@@ -30,12 +31,6 @@ NEIGHBOR_COUNT = 16
 
 FLAT_RATIO = 0.35
 """A Gaussian whose smallest scale is below this part of its middle one has an orientation of its own."""
-
-LIFT_IN_REACHES = 4.0
-"""Lift of rays from points that views show, in root mean square reaches of the Gaussians above them.
-
-On reconstructions of two captures 3 to 5 give ambient occlusion within 0.2 dB of each other but for one: 3 loses 0.8 dB
-on one of them to self-shadowing (docs/materials.md)."""
 
 ORIENTATION_RAYS = 8
 SMOOTHING_PASSES = 3
@@ -78,6 +73,7 @@ class SurfacePoints:
         seen: Points worth measuring; what hardly any view shows is filled from neighbours, ``(N,)`` bool.
         normal_error: By how much normals may be off [rad], ``(N,)`` float32; 0 where it is not known.
         confidence: Of the normals, in [0, 1], ``(N,)`` float32.
+        tracing: What is in the way of rays from these points.
     """
 
     positions: wp.array
@@ -86,6 +82,7 @@ class SurfacePoints:
     seen: NDArray[np.bool_]
     normal_error: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    tracing: TraceOptions = EXACT
 
     @classmethod
     def at_centers(
@@ -107,45 +104,42 @@ class SurfacePoints:
     def seen_by(
         cls, cloud: GaussianCloud, evidence: ViewEvidence, scene: Scene, offset: float | Literal["auto"] = "auto"
     ) -> SurfacePoints:
-        """Take the points that views show.
+        """Take the points that views show, and give the scene's Gaussians the normals there.
 
-        ``"auto"`` lifts rays by `LIFT_IN_REACHES` times how far the Gaussians around reach above the point.
-        `beam_warp.trace.rays.ray_offsets` looks for the surface first and takes all that is around it for its
-        thickness, buried layers included; of a point that views show the place is known, and only what is above it
-        can shade it by mistake.
+        Such a point lies within the layer that shows it. So rays from it meet only what faces them: the normals of its
+        own face point along them, on the way out. With ``"auto"`` they need no lift then, which would carry them out of
+        creases. `beam_warp.trace.rays.ray_offsets` has to look for the surface first, and to leave it.
+
+        Args:
+            cloud: The Gaussians.
+            evidence: What views show of them.
+            scene: The same Gaussians, uploaded; it has normals afterwards: those of the nearest seen one for the rest.
+            offset: Lift of rays [m]; ``"auto"`` for none.
         """
         device = scene.device
         agreement = evidence.agreement.numpy()
         rows = np.flatnonzero(evidence.seen)
         near = _neighbors(evidence.positions.numpy()[rows], device)
-        # What views hardly show of a neighbour is hidden by others: it hides nothing itself.
+        # What views hardly show of a neighbour is hidden by others: it says little of the face.
         weights = upload((cloud.opacities * np.minimum(evidence.weight, 1.0))[rows].astype(np.float32), float, device)
         places = upload(evidence.positions.numpy()[rows], wp.vec3, device)
         faces = _face_normals(cloud, evidence, rows, places, weights, near)
         normals = evidence.normals.numpy().copy()
-        normals[rows] = faces.numpy()
-        normals = upload(normals, wp.vec3, device)
-        if offset != "auto":
-            offsets = ray_offsets(scene, evidence.positions, normals, offset)
-        else:
-            reach = wp.empty(len(rows), dtype=float, device=device)
-            seen = cloud.select(rows)
-            gaussians = (
-                upload(seen.positions, wp.vec3, device),
-                upload(seen.orientations, wp.quat, device),
-                upload(seen.scales, wp.vec3, device),
-            )
-            launch_reach_above(places, faces, gaussians, weights, near, reach, device)
-            lifts = np.zeros(len(cloud), np.float32)
-            lifts[rows] = LIFT_IN_REACHES * reach.numpy()
-            offsets = upload(lifts, float, device)
+        normals[rows] = faces
+        facing = normals.copy()
+        if len(rows):
+            hidden = np.flatnonzero(~evidence.seen)
+            facing[hidden] = faces[cKDTree(cloud.positions[rows]).query(cloud.positions[hidden], workers=-1)[1]]
+        scene.face(facing)
+        lift = 0.0 if offset == "auto" else require_number("offset", offset)
         return cls(
             evidence.positions,
-            normals,
-            offsets,
+            upload(normals, wp.vec3, device),
+            wp.full(len(cloud), lift, dtype=float, device=device),
             evidence.seen,
             np.arccos(np.clip(agreement, 0.0, 1.0)).astype(np.float32),
             agreement,
+            FACING,
         )
 
 
@@ -223,8 +217,8 @@ def _face_normals(
     places: wp.array,
     weights: wp.array,
     near: wp.array,
-) -> wp.array:
-    """Return normals of seen Gaussians that stay crisp at edges, ``(S,)`` vec3.
+) -> NDArray[np.float32]:
+    """Return normals of seen Gaussians that stay crisp at edges, ``(S, 3)``.
 
     What pixels see is a blend of the Gaussians in them, and spread back it is blended once more: edges are rounded
     by two pixels. A flat Gaussian's own axis is not blended, but it is noisy; so it is averaged over its face. Where
@@ -243,7 +237,7 @@ def _face_normals(
         current, following = following, current
     faces = current.numpy()
     agrees = (faces * blended).sum(axis=1) > np.cos(0.5 * FACE_SPREAD)
-    return upload(np.where(agrees[:, None], blended, faces), wp.vec3, device)
+    return np.where(agrees[:, None], blended, faces)
 
 
 def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -128,7 +128,7 @@ class FitOptions:
     target_psnr: float | None = None
     color_iterations: int = 1_000
     normal_iterations: int = 2_000
-    weights: LossWeights = field(default_factory=lambda: LossWeights(normal=2.5, normal_tolerance=0.1))
+    weights: LossWeights = field(default_factory=lambda: LossWeights(normal=5.0, normal_tolerance=0.02))
     rates: LearningRates = field(default_factory=LearningRates)
     sh_degree: int = 2
     samples: int | Literal["auto"] = "auto"

@@ -157,6 +157,18 @@ class Scene:
         normals = self.occluders.gaussians.normals
         return normals is not None and len(normals) > 0
 
+    def face(self, normals: Any) -> None:
+        """Give the scene's Gaussians normals, in place, or others than they came with.
+
+        Args:
+            normals: Unit normals, ``(N, 3)`` float32, NumPy or a warp array of vec3 on the scene's device.
+
+        Raises:
+            InvalidArrayError: The shape or type breaks the contract above.
+        """
+        self.packed.gaussians.normals = _device_rows("normals", normals, 3, wp.vec3, len(self), self.device)
+        self.occluders.gaussians = self.packed.gaussians
+
     def __reduce__(self) -> NoReturn:
         """Refuse copies and pickles: what is on a device belongs to one process.
 

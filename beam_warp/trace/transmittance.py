@@ -70,6 +70,9 @@ class TraceOptions:
 EXACT = TraceOptions()
 """Products, peaks in front, stopped below 1e-4: what everything uses unless told otherwise."""
 
+FACING = TraceOptions(cull=True)
+"""The same among Gaussians that face the ray: for rays that start within the layer of a surface that is closed."""
+
 
 def visibility(
     scene: Scene, origins: Any, directions: Any, *, t_max: Any = math.inf, options: TraceOptions = EXACT, seed: int = 0

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch, launcher
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -131,40 +131,6 @@ def mean_of_face_kernel(
     out_normals[i] = own
 
 
-@wp.kernel
-def reach_above_kernel(
-    first: int,
-    points: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    centers: wp.array[wp.vec3],
-    orientations: wp.array[wp.quat],
-    scales: wp.array[wp.vec3],
-    weights: wp.array[float],
-    neighbors: wp.array2d[int],
-    out_reach: wp.array[float],
-):
-    """Root mean square of how far a point's neighbours reach above its tangent plane.
-
-    Each by the height of its centre, if that is above, and its standard deviation along the normal. What lies below
-    a point of the surface hides no light from it, however deep the layer is.
-    """
-    i = first + wp.tid()
-    n = normals[i]
-    total = float(0.0)
-    squares = float(0.0)
-    for k in range(neighbors.shape[1]):
-        j = neighbors[i, k]
-        height = wp.max(wp.dot(centers[j] - points[i], n), 0.0)
-        along = wp.quat_rotate_inv(wp.normalize(orientations[j]), n)
-        extent = wp.cw_mul(along, scales[j])
-        total += weights[j]
-        squares += weights[j] * (height * height + wp.dot(extent, extent))
-    reach = float(0.0)
-    if total > 0.0:
-        reach = wp.sqrt(squares / total)
-    out_reach[i] = reach
-
-
 launch_thinnest_direction = launcher(thinnest_direction_kernel)
 """Analyse every Gaussian's neighbourhood: in ``neighbors``, column 0 is the Gaussian itself."""
 
@@ -175,9 +141,3 @@ launch_consult_neighbors = launcher(consult_neighbors_kernel)
 
 launch_mean_of_face = launcher(mean_of_face_kernel)
 """Do one pass of smoothing that edges stop."""
-
-
-def launch_reach_above(points, normals, gaussians, weights, neighbors, out_reach, device):
-    """Measure how far neighbours reach above points; ``gaussians`` are centres, orientations and scales."""
-    inputs = [points, normals, *gaussians, weights, neighbors]
-    launch(reach_above_kernel, len(points), inputs=inputs, outputs=[out_reach], device=device)

@@ -17,7 +17,9 @@ from beam_warp.materials.evidence import RADII, view_evidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.channels import RADIANCE
 from beam_warp.raster.gbuffer import rasterize
+from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
+from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.camera import Camera
 from beam_warp.world.harmonics import SH_C0
 
@@ -98,9 +100,16 @@ class TestSurface:
         height = found.positions.numpy()[inside & found.seen, 2]
         assert (height > -0.0041).all()
         assert (height < 1e-4).all()
-        offsets = SurfacePoints.seen_by(both, found, Scene.from_gaussians(both, device)).offsets.numpy()
-        # thin tiles: 0.1 of 0.65 * 0.05 in deviation, and the upper layer's height above what is seen
-        assert 0.0 < np.median(offsets[inside & found.seen]) < 0.03
+        scene = Scene.from_gaussians(both, device)
+        points = SurfacePoints.seen_by(both, found, scene)
+
+        def openness(tracing):
+            given = {"offset": points.offsets, "options": tracing, "sample_count": 16}
+            found = ambient_occlusion(scene, points.positions, points.normals, **given)
+            return found.visibility.numpy()[inside & points.seen]
+
+        assert openness(points.tracing).min() > 0.999  # nothing of the layer that rays start in shades them
+        assert np.median(openness(EXACT)) < 0.5
 
 
 class TestFaces:

@@ -102,6 +102,17 @@ def test_a_crash_of_the_child_is_one_error(tmp_path, sequence, monkeypatch):
         validate(tmp_path / "a.usdc")
 
 
+def test_the_child_works_in_one_thread(tmp_path, sequence):
+    """Each thread takes memory: with one for each of 64 cores, the child's limit left none for a sound file."""
+    path = write_asset(sequence(1), tmp_path / "a.usdc")[-1]
+    program = (
+        "import sys; from pathlib import Path; from pxr import Work; from beam_warp.schema.probe import limit_memory;"
+        "limit_memory(Path(sys.argv[1])); print(Work.GetConcurrencyLimit())"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", program, str(path)], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1"]
+
+
 def test_packages_that_reach_outside_are_refused(tmp_path):
     import zipfile
 

@@ -221,6 +221,19 @@ class TestScene:
         with pytest.raises(InvalidOptionError, match="cull must be False for a scene without normals, got True"):
             visibility(scene, *along_x(), options=TraceOptions(cull=True))
 
+    def test_normals_may_come_later(self, device, rng):
+        cloud, rays = random_cloud(rng, 200), random_rays(rng, 50)
+        scene, facing = Scene.from_gaussians(cloud, device), TraceOptions(cull=True)
+        normals = unit(rng.normal(size=(len(cloud), 3))).astype(np.float32)
+        given = cloud.with_arrays(normals=normals)
+        scene.face(normals)
+        found = visibility(scene, *rays, options=facing)
+        assert np.array_equal(found, visibility(Scene.from_gaussians(given, device), *rays, options=facing))
+        assert (found >= visibility(scene, *rays)).all()
+        assert (found > visibility(scene, *rays)).any()
+        with pytest.raises(InvalidArrayError, match="normals must have as many rows"):
+            scene.face(normals[1:])
+
     def test_no_rays(self, device, rng):
         scene = Scene.from_gaussians(random_cloud(rng, 5), device)
         assert visibility(scene, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
