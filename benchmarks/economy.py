@@ -1,19 +1,21 @@
 """What do rays bring where they are needed, instead of as many for every Gaussian: error, bias, time and scores?
 
-    python benchmarks/economy.py [--device cuda:0] --out JSON
+    python benchmarks/economy.py [--device cuda:0] [--parts light occlusion bounce] --out JSON
 
 Materials of Gaussians on the true surface of three captures and of the demo's are measured with every Gaussian's light
 by as many rays, and by as many as its neighbours' first rays say that it needs. Errors are of the arriving light at
 each Gaussian, relative to it or to a twentieth of its mean, against many rays by another density. *Equal* is how many
 rays for each have the same error, between those that were measured. *Stopped* is what not to do: each Gaussian stops
 once its own rays agree; and *occlusion* is what the same rule would bring there. Both are looked up in the runs with as
-many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn.
+many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn. *Bounce* is
+the error of the bounced light over all light: without it, by as many rays for each, and by as many as it needs.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,14 @@ from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import MaterialMeasurement, measure_materials
-from beam_warp.materials.light_rays import MaterialOptions
+from beam_warp.materials.light_rays import (
+    BOUNCE_PART,
+    LitPoints,
+    MaterialOptions,
+    light_batches,
+    lit_points,
+    mean_radiance,
+)
 from beam_warp.materials.pilot import rays_needed
 from beam_warp.reconstruction.scores import truth_frames
 from beam_warp.study.true_surface import SHARP
@@ -123,7 +132,7 @@ def light_of(subject: Subject, device: Any, repeats: int) -> dict[str, Any]:
     rows[FIXED.index(default)] |= {"seconds": spread(times[0.0].alone), "scores": subject.scores(fixed[default])}
     for target in TARGETS:
         found = subject.measured(ways[target])
-        row = {"name": f"target {target:g}", "rays": found.economy["rays"] / found.economy["points"]}
+        row = {"name": f"target {target:g}", "rays": found.economy["light"]["rays"] / found.economy["light"]["points"]}
         row |= summary(subject.errors(found))
         row["equal_rays"] = equal_rays(row["rmse"], errors)
         row |= {"seconds": spread(times[target].alone), "scores": subject.scores(found)}
@@ -169,6 +178,39 @@ def occlusion_of(subject: Subject, rays: int) -> list[dict[str, Any]]:
     return result
 
 
+def bounce_of(subject: Subject, rays: int, device: Any, repeats: int) -> list[dict[str, Any]]:
+    """Return the errors of the bounce over all light, without it, by rays for each and by need, and what they cost."""
+    frame, light, scene, points = subject.frame, subject.light, subject.frame.scene, subject.points
+    sent = mean_radiance(frame.cloud, frame.evidence)
+
+    def traced(options: MaterialOptions) -> LitPoints:
+        found = lit_points(frame.cloud, points, subject.roughness, light, subject.rows, frame.evidence)
+        for _ in light_batches(scene, points, light, found, options, sent, 0, lambda *_: None):
+            pass
+        return found
+
+    default = MaterialOptions()
+    exact = traced(replace(default, light_error=0.0, sample_count=BOUNCE_PART * rays, seed=1 << 31))
+    truth, arriving = exact.light.bounce.numpy().astype(np.float64), exact.light.arriving.numpy()
+    ways = {
+        "none": replace(default, bounce=False),
+        "as many rays each": replace(default, light_error=0.0),
+        "as many as needed": default,
+    }
+    times = take_turns({k: Task(lambda o=o: subject.measured(o)) for k, o in ways.items()}, repeats, device)
+    rows = []
+    for name, options in ways.items():
+        found = traced(options)
+        bounce = found.light.bounce.numpy() if options.bounce else np.zeros_like(truth)
+        row = {"name": name, "rays": float(found.bounce_rays.mean()) if options.bounce else 0.0}
+        row |= summary((bounce - truth) / np.maximum(arriving + truth, 0.05 * (arriving + truth).mean()))
+        rows.append(row | {"seconds": spread(times[name].alone), "scores": subject.scores(subject.measured(options))})
+    return rows
+
+
+PARTS = ("light", "occlusion", "bounce")
+
+
 def main() -> None:
     """Measure every subject and write what came out."""
     parser = record.parser(__doc__, device="cpu", data=True)
@@ -176,6 +218,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--reference-rays", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=REPEATS)
+    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}
@@ -186,14 +229,15 @@ def main() -> None:
             else:
                 capture = Capture.read(Path(given.data) / "captures" / name)
             subject = Subject(capture, given.gaussians, given.reference_rays, device)
-            found = light_of(subject, device, given.repeats)
-            rows[name] = {
-                "points": len(subject.rows),
-                "light": found,
-                "occlusion": occlusion_of(subject, given.reference_rays),
-            }
+            rows[name] = {"points": len(subject.rows)}
+            if "light" in given.parts:
+                rows[name]["light"] = light_of(subject, device, given.repeats)
+            if "occlusion" in given.parts:
+                rows[name]["occlusion"] = occlusion_of(subject, given.reference_rays)
+            if "bounce" in given.parts:
+                rows[name]["bounce"] = bounce_of(subject, given.reference_rays, device, given.repeats)
             record.write_result(given, device, {"captures": rows})
-            for row in found["rows"]:
+            for row in [*rows[name].get("light", {}).get("rows", ()), *rows[name].get("bounce", ())]:
                 print(name, {key: value for key, value in row.items() if key != "seconds"}, flush=True)
 
 

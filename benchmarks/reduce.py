@@ -74,8 +74,6 @@ Keep = Callable[[Reducer, GaussianCloud, int, Path | None], GaussianCloud]
 FRESH, FRESH_PAIRS = 77, 200
 """Seed and number of draws that no search and no certificate saw."""
 
-DEFAULT_STEPS = ReduceOptions(gaussians=1).steps
-
 MOST_LOSS = 1.0
 """Bound that the fewest Gaussians are asked for [dB]."""
 
@@ -235,8 +233,8 @@ def sizes(bench: Bench) -> Iterator[Row]:
             return said if truth is None else said | {"truth_loss": truth - (against_truth(name, one, bench) or 0.0)}
 
         cloud = change_axes(original[0], "rfu")
-        for share in bench.shares:
-            for contender, keep in CONTENDERS.items():
+        for contender, keep in CONTENDERS.items():
+            for share in bench.shares:
                 row: Row = {"name": f"{name} {share:g} {contender}", "asset": name, "share": share, "truth": truth}
                 row |= {"contender": contender, "original": len(cloud), "sensitivity_seconds": measured}
                 place = None if bench.made is None else bench.made / f"{name}_{share:g}.ply"
@@ -262,7 +260,7 @@ def contend(
     bare = keep(reducer, cloud, count, place)
     chosen = time.perf_counter()
     turn = Rotation.identity(len(bare))
-    how = {"steps": reducer.options.steps, "raster": reducer.raster, "device": reducer._device}
+    how = {"steps": reducer.steps, "raster": reducer.raster, "device": reducer._device}
     fitted = changed(bare, turn, refit({0: (bare, turn)}, reducer.sensitivity, **how))
     ended = time.perf_counter()
     found = {"gaussians": len(bare), "chosen_seconds": chosen - started, "refit_seconds": ended - chosen}
@@ -278,7 +276,7 @@ def certified(bench: Bench) -> Iterator[Row]:
         truth = against_truth(name, original, bench) or ASSET_PSNR
         for target in ({"gaussians": round(bench.shares[0] * len(original[0]))}, {"max_loss": MOST_LOSS}):
             changes: Row = {"gaussians": None, "asset_psnr": truth, "height": height, **target}
-            options = replace(bench.options, steps=min(DEFAULT_STEPS, bench.options.steps), **changes)
+            options = replace(bench.options, **changes)
             rows.append({"name": f"{name} {target}", "asset": name, "target": target, "asset_psnr": truth})
             with tempfile.TemporaryDirectory() as folder:
                 started = time.perf_counter()
@@ -309,7 +307,10 @@ def main() -> int:
     parser.add_argument("--assets", nargs="+", default=["figure", *CAPTURES], metavar="NAME")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    count, height, tests, views, steps = (140_000, 512, 100, 48, 1000) if device.is_cuda else (3_000, 56, 12, 20, 80)
+    default = ReduceOptions(gaussians=1)
+    count, height, tests, views, steps = 3_000, 56, 12, 20, 80
+    if device.is_cuda:
+        count, height, tests, views, steps = 140_000, 512, 100, default.views, default.steps
     if arguments.quick:
         arguments.assets, count, height, tests, views, steps = ["figure"], 800, 48, 4, 4, 4
     options = ReduceOptions(gaussians=1, height=height, views=views, steps=steps, device=device)

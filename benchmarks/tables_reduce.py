@@ -21,7 +21,9 @@ def sizes(result: Row) -> Rows:
     """Return PSNR against the original and loss against the truth of every contender, by asset."""
     head = ["asset", "kept", "by", "PSNR [dB]", "loss [dB]", "refitted: PSNR [dB]", "loss [dB]", "counted loss [dB]"]
     rows: list[list[Any]] = [head]
-    for row in result["sizes"]["rows"]:
+    found_rows = result["sizes"]["rows"]
+    assets = told_apart(found_rows, "asset")
+    for row in sorted(found_rows, key=lambda row: (assets.index(row["asset"]), -row["share"])):
         if "refit" in row:
             numbers = (("bare", "psnr", ".1f"), ("bare", "truth_loss", ".2f"), ("refit", "psnr", ".1f"))
             numbers = (*numbers, ("refit", "truth_loss", ".2f"), ("refit", "loss", ".2f"))

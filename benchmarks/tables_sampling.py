@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from tables import Row, Rows, figure, number, slug, step, table
 
+from beam_warp.materials.pilot import RATE
 from beam_warp.study.picture import write_image
 from beam_warp.study.table import read_table
 
@@ -92,6 +93,20 @@ def economy_occlusion(result: Row) -> Rows:
     for target in targets:
         found = [step(subject["occlusion"], slug(target)) for subject in result["captures"].values()]
         rows.append([target, *(f"{row['rays']:.0f} ({row['equal_rays']:.0f})" for row in found)])
+    return rows
+
+
+@table("economy_bounce", "economy_bounce_h200.json")
+def economy_bounce(result: Row) -> Rows:
+    """The bounce without rays, by as many for each, and by as many as it needs."""
+    rows: list[list[Any]] = [["", "rays", "error", "the same for each", "mean error", "base colour"]]
+    for name, found in result["captures"].items():
+        none, same, needed = found["bounce"]
+        for words, row in ((", without", none), (", as many each", same), (", as many as needed", needed)):
+            equal = same["rays"] * (same["rmse"] / needed["rmse"]) ** (1.0 / RATE) if row is needed else None
+            cells = [f"{row['rays']:.0f}", f"{100 * row['rmse']:.1f} %", "" if equal is None else f"{equal:.0f}"]
+            color = f"{row['scores']['base_color']:.2f} dB"
+            rows.append([name + words, *cells, f"{row['mean_in_standard_errors']:+.1f}", color])
     return rows
 
 

@@ -36,6 +36,12 @@ def targets(result: Row) -> Rows:
     return rows
 
 
+@table("targets_reduce", "targets_reduce_cpu.json")
+def of_reduce(result: Row) -> Rows:
+    """Return the same for `beam reduce`."""
+    return targets(result)
+
+
 @table("targets_unseen", "targets_h200.json")
 def unseen(result: Row) -> Rows:
     """Return the same of targets drawn with another seed, on a GPU."""

@@ -1,6 +1,6 @@
 """Whether targets are met: runs of the commands on small scenes, each with a target of its own.
 
-    python benchmarks/targets.py [--device cuda:0] [--runs 40] [--seed 0] --out result.json
+    python benchmarks/targets.py [--device cuda:0] [--runs 40] [--seed 0] [--commands reduce] --out result.json
 
 Targets are drawn at random around what small scenes take. One that is refused is asked for again as the refusal offers.
 The result is written after every run.
@@ -49,6 +49,9 @@ CASES: tuple[tuple[str, str, float], ...] = (
     ("reconstruct", "seconds", 100.0),
     ("run capture", "error", 0.15),
     ("run capture", "seconds", 150.0),
+    ("reduce", "error", 0.05),
+    ("reduce", "fps", 60.0),
+    ("reduce", "seconds", 100.0),
 )
 """Commands, what is asked of them, and about which value; *run capture* goes all the way from photographs."""
 
@@ -76,6 +79,7 @@ def scenes(folder: Path, device: str) -> dict[str, list[str]]:
         "decompose": [str(folder / "bare.usda"), *lit],
         "render": [str(folder / "asset.usda"), *lit, "--width", "64"],
         "reconstruct": modelled,
+        "reduce": [str(folder / "asset.usda"), "--height", "48", "--views", "24"],
     }
 
 
@@ -91,8 +95,9 @@ def measured(case: tuple[str, str, float], factor: float, words: list[str], out:
     """Run one case at a factor of its usual value."""
     command, name, usual = case
     first, *mode = command.removesuffix(" capture").split()
-    place = out / "image.png" if first == "render" else out
+    place = out / {"render": "image.png", "reduce": "asset.usda"}.get(first, "")
     line = [first, *words, *mode, "--out", str(place), "--device", device]
+    line += ["--gaussians", "300"] if (first, name) == ("reduce", "seconds") else []
     value, refused, started = float(f"{factor * usual:.3g}"), False, time.perf_counter()
     said, refusal = asked([*line, f"--target-{name}", str(value)])
     offered = OFFERED.search(refusal)
@@ -110,6 +115,7 @@ def main() -> int:
     parser = record.parser(__doc__, device=None)
     parser.add_argument("--runs", type=int, default=40, metavar="N")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commands", nargs="+", metavar="NAME", help="only these; all of them without")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     keep = functools.partial(record.write_result, arguments, device)
@@ -117,8 +123,9 @@ def main() -> int:
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="beam_targets_") as folder:
         words = scenes(Path(folder), str(device))
+        cases = [case for case in CASES if arguments.commands is None or case[0] in arguments.commands]
         for number, factor in enumerate(factors):
-            case = CASES[number % len(CASES)]
+            case = cases[number % len(cases)]
             out = Path(folder) / f"out_{number}"
             out.mkdir()
             of_case = words.get(case[0]) or words[case[0].split()[0]]

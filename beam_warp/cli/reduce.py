@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -14,6 +15,7 @@ from beam_warp.cli.common.console import print_json, print_notes, progress
 from beam_warp.cli.common.flags import Device, Json, Quiet, ReadingFlags, Seed, notes_of
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.errors import InvalidOptionError
+from beam_warp.study.targets import Rung, Target, in_words, outcome
 
 if TYPE_CHECKING:
     from beam_warp.reduction.job import Reduction
@@ -43,8 +45,17 @@ class Reduce:
     max_flip: Annotated[float | None, arg(metavar="X", help="Most FLIP against the original, in 19 of 20 draws.")] = (
         None
     )
+    target_error: Annotated[
+        float | None, arg(metavar="E", help="Most RMS error of display values against the original, in 19 of 20 draws.")
+    ] = None
     size: Annotated[str | None, arg(metavar="BYTES", help="Most bytes of the file, such as 20MB.")] = None
     gaussians: Annotated[int | None, arg(metavar="N", help="Number of Gaussians.")] = None
+    target_fps: Annotated[
+        float | None, arg(metavar="F", help="As many Gaussians as this device draws so often a second.")
+    ] = None
+    target_seconds: Annotated[
+        float | None, arg(metavar="S", help="With --gaussians: refit for as long as this whole call may take.")
+    ] = None
     asset_psnr: Annotated[
         float, arg(metavar="DB", help="What the asset's relit images have against the truth, as beam evaluate says.")
     ] = 35.0
@@ -54,8 +65,10 @@ class Reduce:
     height: Annotated[int, arg(metavar="PX", help="Side of compared images: how large it will be seen.")] = 256
     pairs: Annotated[int, arg(metavar="N", help="Draws of light, camera and frame for the certificate.")] = 200
     confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate.")] = 0.95
-    views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 48
-    steps: Annotated[Annotated[int, arg(metavar="N", help="Steps of a refit.")], SECOND_PAGE] = 600
+    views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 144
+    steps: Annotated[
+        int | None, arg(metavar="N", help="Steps of a refit; by default 2880 on a GPU, 600 elsewhere."), SECOND_PAGE
+    ] = None
     reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
     seed: Seed = 0
     device: Device = None
@@ -71,32 +84,50 @@ def reduce(args: Reduce) -> int:
     from beam_warp.world.environment import EnvironmentMap
 
     sequence = args.reading.read(args.asset)
+    environments = [EnvironmentMap.read(path) for path in args.environment] or [*demo_environments().values()]
     options = ReduceOptions(
         max_loss=args.max_loss,
         max_flip=args.max_flip,
+        target_error=args.target_error,
         size=None if args.size is None else bytes_of(args.size),
         gaussians=args.gaussians,
+        target_fps=args.target_fps,
         asset_psnr=args.asset_psnr,
         height=args.height,
         pairs=args.pairs,
         confidence=args.confidence,
         views=args.views,
         steps=args.steps,
+        target_seconds=args.target_seconds,
+        spent=time.perf_counter() - started,
         seed=args.seed,
         raster=args.reading.raster(sequence),
         device=args.device,
     )
-    environments = [EnvironmentMap.read(path) for path in args.environment] or [*demo_environments().values()]
     with progress(args.quiet or args.json) as report:
         found = reduce_asset(sequence, environments, options, args.out, progress=report)
     seconds = time.perf_counter() - started
+    target = _target(args, found, seconds)
     if args.json:
-        print_json({**_facts(found), "seconds": round(seconds, 3), "notes": notes_of(sequence)})
+        said = {"target": target} if target else {}
+        print_json({**_facts(found), "seconds": round(seconds, 3), "notes": notes_of(sequence), **said})
     elif not args.quiet:
         print_notes(notes_of(sequence))
         print(f"{found.count:,} of {found.original_count:,} Gaussians in {args.out}, {seconds:.1f} s")
         print(f"certified: {found.certificate}")
+        if target:
+            print(in_words(target))
     return 0
+
+
+def _target(args: Reduce, found: Reduction, seconds: float) -> dict[str, Any]:
+    """Return what is said of a target; empty if none was asked. An error is what the certificate bounds."""
+    asked = Target(error=args.target_error, seconds=args.target_seconds, fps=args.target_fps)
+    if not asked.asked():
+        return {}
+    chosen = Rung(settings={"gaussians": found.count, "steps": found.steps}, seconds=math.nan, frame_seconds=math.nan)
+    reached = {"error": found.certificate.bound, "seconds": seconds, "fps": found.fps}
+    return outcome(asked, chosen, reached if args.target_error is not None else {**reached, "error": None})
 
 
 def bytes_of(text: str) -> int:
@@ -118,6 +149,7 @@ def _facts(found: Reduction) -> dict[str, object]:
         "original": found.original_count,
         "bytes": sum(path.stat().st_size for path in found.paths),
         "error_scale": found.error_scale,
+        "fps": found.fps,
         "candidates": [{"gaussians": count, "error": error} for count, error in found.candidates],
         "certificate": asdict(found.certificate),
     }

@@ -21,7 +21,7 @@ from scipy import special
 from beam_warp.digests import array_digest
 from beam_warp.errors import AssetFormatError, InvalidOptionError
 from beam_warp.evaluate.physical_rules import CERTIFIED, Measured
-from beam_warp.evaluate.relit import RelitComparison
+from beam_warp.evaluate.relit import MEASURES, RelitComparison
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
@@ -44,7 +44,7 @@ class Certificate:
     """What is known about the errors of an asset.
 
     Attributes:
-        measure: ``loss`` [dB], see `beam_warp.evaluate.relit.loss_of`, or ``flip``.
+        measure: One of `beam_warp.evaluate.relit.MEASURES`.
         bound: Bound on the error of a draw.
         share: Least share of all draws whose error is within the bound.
         confidence: Confidence of that share, over everything that was tried.
@@ -107,7 +107,7 @@ class Certificate:
                 if kind is not None:
                     record[field.name] = kind(record[field.name])
             made = cls(**record)
-            sound = made.measure in ("loss", "flip") and 0 < made.pairs <= MOST_PAIRS and len(made.mean) == 3
+            sound = made.measure in MEASURES and 0 < made.pairs <= MOST_PAIRS and len(made.mean) == 3
             sound = sound and 0.0 < made.confidence < 1.0 and 0.0 <= made.first <= 2**31 and made.bound >= 0.0
             sound = sound and {"environments", "height", "seed"} <= set(made.distribution)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
@@ -133,7 +133,7 @@ def certify(
     Args:
         comparison: With the original and the distribution.
         asset: What is certified, as it is stored.
-        measure: ``loss`` or ``flip``.
+        measure: One of `beam_warp.evaluate.relit.MEASURES`.
         bound: See `Certificate`.
         pairs: Number of draws.
         first: Number of the first one.

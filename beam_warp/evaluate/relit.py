@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,10 @@ from beam_warp.world.shot import RenderedImage
 
 ASSET_PSNR = 35.0
 """PSNR of an asset's relit images against the truth where nobody measured it: that of a good one [dB]."""
+
+
+MEASURES = ("loss", "flip", "error")
+"""Errors of relit images by name: `loss_of` [dB], mean FLIP, and the root mean square of display values, 0 to 1."""
 
 
 def compared_options(height: int) -> DeferredOptions:
@@ -56,9 +61,11 @@ class RelitErrors:
     asset_psnr: float = ASSET_PSNR
 
     def values(self, measure: str) -> NDArray[np.float64]:
-        """Return errors by the name of their measure: ``loss`` [dB], see `loss_of`, or ``flip``."""
+        """Return errors by the name of their measure, one of `MEASURES`."""
         if measure == "loss":
             return loss_of(self.psnr, self.asset_psnr)
+        if measure == "error":
+            return 10.0 ** (-self.psnr / 20.0)
         assert self.flip is not None
         return self.flip
 
@@ -114,13 +121,23 @@ class RelitComparison:
                     found[place], flip[place] = self._compared(trial, *pair, keep)
         return RelitErrors(found, None if self._flip is None else flip, self.asset_psnr)
 
+    def seconds(self, asset: GaussianSequence, trials: Sequence[Trial]) -> float:
+        """Return how long an image of an asset takes to draw [s], the median over trials of its first frame."""
+        cloud, times = world(asset, 0), []
+        shots = [self.trials.shot(trial, cloud, cloud) for trial in trials]
+        for shot in (*shots, *shots):  # the first round makes room for each kind of light
+            started = time.perf_counter()
+            self._renderers[1].draw(shot)
+            times.append(time.perf_counter() - started)
+        return float(np.median(times[len(shots) :]))
+
     def _compared(self, trial: Trial, original: GaussianCloud, cloud: GaussianCloud, keep: bool) -> tuple[float, float]:
-        truth = self._kept.get(trial)
+        truth, shot = self._kept.get(trial), self.trials.shot(trial, cloud, original)
         if truth is None:
-            truth = self._renderers[0].draw(self.trials.shot(trial, original, original))
+            truth = self._renderers[0].draw(replace(shot, cloud=original))
             if keep:
                 self._kept[trial] = truth
-        found = self._renderers[1].draw(self.trials.shot(trial, cloud, original))
+        found = self._renderers[1].draw(shot)
         box = bounding_box(truth.alpha)
         images = [linear_to_srgb(np.clip(each.rgb[box], 0.0, 1.0)).astype(np.float32) for each in (found, truth)]
         shown, wanted = images

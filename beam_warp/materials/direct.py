@@ -91,7 +91,7 @@ class MaterialMeasurement:
     """One frame's ambient occlusion with its standard error, ``(N,)`` each, and its evidence on base colour.
 
     ``ray_count`` is how many rays were traced for both, those of the bounce left out; ``economy`` is what fewer rays
-    for some have left out (`beam_warp.materials.pilot.economy`).
+    for some have left out (`beam_warp.materials.pilot.economy`), of the light and of the bounce.
     """
 
     ambient_occlusion: NDArray[np.float32]
@@ -197,7 +197,12 @@ def measure_materials(
         by_row(occlusion.standard_error.numpy(), shown, 1.0),
         evidence,
         options.sample_count * len(shown) + int(measured.rays.sum()),
-        economy(measured.light.noise.numpy(), measured.rays, options.light_rays[1]),
+        {
+            "light": economy(measured.light.noise.numpy(), measured.rays, options.light_rays[1]),
+            "bounce": economy(
+                measured.bounce_noise(), measured.bounce_rays, options.bounce_rays[1], share=measured.bounce_share()
+            ),
+        },
     )
 
 

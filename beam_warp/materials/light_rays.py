@@ -78,7 +78,7 @@ class MaterialOptions:
         light_error: Relative standard error, as it is stated, with which a Gaussian gets ``sample_count`` rays towards
             the light. Others get from a quarter to four times as many, those with larger errors more, as the first rays
             of their neighbours tell (`beam_warp.materials.pilot`). With 0, and for sets that do not go on
-            (``"stratified"``, ``"mis"``), each gets ``sample_count``.
+            (``"stratified"``, ``"mis"``), each gets ``sample_count``. The bounce is treated in the same way.
         offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.trace.rays`.
         bounce: Add one bounce from the captured radiance of what rays hit (the paper leaves it out).
         diffuse_weight: What the specular lobe leaves for diffusion, one of `DIFFUSE_WEIGHTS`.
@@ -117,10 +117,23 @@ class MaterialOptions:
     @property
     def light_rays(self) -> tuple[int, int]:
         """Fewest and most rays towards the light of a Gaussian."""
+        return self._around(self.sample_count)
+
+    @property
+    def usual_bounce_rays(self) -> int:
+        """Rays of the bounce of a Gaussian where none gets more than another."""
+        return max(self.sample_count // BOUNCE_PART, 2)
+
+    @property
+    def bounce_rays(self) -> tuple[int, int]:
+        """Fewest and most rays of the bounce of a Gaussian."""
+        return self._around(self.usual_bounce_rays)
+
+    def _around(self, count: int) -> tuple[int, int]:
         if self.light_error == 0.0 or self.sampler == "stratified" or self.density == "mis":
-            return self.sample_count, self.sample_count
-        fewest = max(self.sample_count // 4, FEWEST_FIRST_RAYS)
-        return fewest, max(4 * self.sample_count, fewest)
+            return count, count
+        fewest = max(count // 4, FEWEST_FIRST_RAYS)
+        return fewest, max(4 * count, fewest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +146,7 @@ class LitPoints:
         views: What views show of them.
         rows: Which Gaussians they are, ``(M,)``.
         rays: How many rays go towards the light, ``(M,)``; filled when `light_batches` begins.
+        bounce_rays: The same of the bounce; 0 where there is none.
     """
 
     light: GatheredLight
@@ -140,6 +154,22 @@ class LitPoints:
     views: Observations
     rows: NDArray[np.int64]
     rays: NDArray[np.int32]
+    bounce_rays: NDArray[np.int32]
+
+    def bounce_noise(self) -> NDArray[np.float32]:
+        """Return the standard error of the bounce over all the light that arrives, ``(M,)``."""
+        return _over_light(self.light)
+
+    def bounce_share(self) -> NDArray[np.float32]:
+        """Return which part of the light that arrives is the bounce's, ``(M,)``."""
+        bounce = self.light.bounce.numpy().sum(axis=1)
+        return bounce / np.maximum(self.light.arriving.numpy().sum(axis=1) + bounce, 1e-12)
+
+
+def _over_light(light: GatheredLight) -> NDArray[np.float32]:
+    """Return the standard error of the bounce over all light."""
+    total = light.arriving.numpy().sum(axis=1) + light.bounce.numpy().sum(axis=1)
+    return light.bounce_error.numpy() / np.maximum(total, 1e-12)
 
 
 def view_set() -> NDArray[np.float32]:
@@ -192,7 +222,8 @@ def lit_points(
     observed.diffuse_share = wp.zeros(observed.directions.shape, dtype=float, device=device)
     arriving = zero_struct(GatheredLight, len(rows), device)
     launch_sum_unshadowed(len(surface.normals), light.moments, surface.normals, arriving.unshadowed, device)
-    return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64), np.zeros(len(rows), np.int32))
+    rays, bounce_rays = np.zeros((2, len(rows)), np.int32)
+    return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64), rays, bounce_rays)
 
 
 def light_batches(
@@ -223,17 +254,14 @@ def light_batches(
     device = scene.device
     if not len(measured.rows):
         return
-    bounced = None if hit_radiance is None else upload(hit_radiance, wp.vec3, device)
-    stream, ways = (options.seed, frame), LightPaths.of(scene, points, light, measured, options, frame)
+    ways = LightPaths.of(scene, points, light, measured, options, frame)
     measured.rays[:], pilot = ways.counted(measured.light)
+    if hit_radiance is not None:
+        measured.bounce_rays[:] = ways.bounced(upload(hit_radiance, wp.vec3, device), measured.light)
     done = 0
     for count in np.unique(measured.rays):
         for batch in ways.batches(int(count), np.flatnonzero(measured.rays == count)):
             found = ways.traced(batch, pilot)
-            if bounced is not None:
-                fewer = max(options.sample_count // BOUNCE_PART, 2)
-                settings = points.tracing.settings(scene)
-                launch_trace_bounce(scene, settings, batch, bounced, stream, fewer, measured.light.bounce)
             launch_gather_light(len(batch.rows), batch, found, int(options.ratio), measured.light, device)
             launch_view_residues(
                 batch,
@@ -348,6 +376,33 @@ class LightPaths:
         for start, part in zip(np.cumsum([0, *map(len, seen)]), seen, strict=False):
             wp.copy(known, part, dest_offset=int(start))
         return needed, Pilot(sample_set(self.options.sampler, first), upload(places, int, device), known)
+
+    def bounced(self, radiance: wp.array, out_light: GatheredLight) -> NDArray[np.int32]:
+        """Gather one bounce, with as many rays as each point needs, and return how many those are.
+
+        Args:
+            radiance: What rays that hit a Gaussian see of it, scene-linear, ``(N,)`` of vec3.
+            out_light: Holds the light that the first rays found, if points differ; its bounce is filled.
+        """
+        (first, most), count, device = self.options.bounce_rays, len(self.positions), self.scene.device
+        needed, rows = np.full(count, first, np.int32), np.arange(count)
+
+        def trace(batches: list[RayBatch]) -> None:
+            counts, stream = upload(needed, int, device), (self.options.seed, self.frame)
+            settings = self.tracing.settings(self.scene)
+            for batch in batches:
+                launch_trace_bounce(self.scene, settings, batch, radiance, stream, counts, out_light)
+
+        batches = self.batches(first, rows)
+        trace(batches)
+        if first < most:
+            usual, target = self.options.usual_bounce_rays, self.options.light_error
+            order = np.concatenate([batch.rows.numpy() for batch in batches])
+            needed[order] = rays_needed(_over_light(out_light)[order], first, most, count=usual, target=target)
+            more = np.flatnonzero(needed > first)
+            if len(more):
+                trace(self.batches(first, more))
+        return needed
 
 
 def require_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:

@@ -54,13 +54,16 @@ def rays_needed(
     return (first * 2 ** np.minimum(doublings, np.floor(np.log2(most / first)))).astype(np.int32)
 
 
-def economy(error: NDArray[np.floating[Any]], rays: NDArray[np.integer[Any]], most: int) -> dict[str, Any]:
+def economy(
+    error: NDArray[np.floating[Any]], rays: NDArray[np.integer[Any]], most: int, *, share: Any = 1.0
+) -> dict[str, Any]:
     """Return what giving each point the rays it needs has left out, as sums that add up over frames.
 
     Args:
         error: Stated standard error of each point, ``(N,)``.
         rays: Rays of each, ``(N,)``.
         most: Rays that each could have had.
+        share: Which part of all light these rays gather, ``(N,)``.
     """
     squares = error.astype(np.float64) ** 2
     return {
@@ -69,18 +72,24 @@ def economy(error: NDArray[np.floating[Any]], rays: NDArray[np.integer[Any]], mo
         "left_out": int((most - rays).sum()),
         "squares": float(squares.sum()),
         "squares_of_most": float((squares * (rays / most) ** (2.0 * RATE)).sum()),
+        "shares": float(np.square(np.broadcast_to(share, squares.shape), dtype=np.float64).sum()),
     }
 
 
-def summary(found: list[Mapping[str, Any]]) -> dict[str, float]:
-    """Return what `economy` said of frames as a report says it; empty if no rays went towards the light."""
-    keys = ("points", "rays", "left_out", "squares", "squares_of_most")
-    points, rays, left_out, squares, fewest = (sum(one.get(key, 0) for one in found) for key in keys)
-    if not points:
-        return {}
-    return {
-        "light_rays_per_gaussian": rays / points,
-        "light_rays_left_out": left_out,
-        "light_error": float(np.sqrt(squares / points)),
-        "light_error_with_all_rays": float(np.sqrt(fewest / points)),
-    }
+def summary(found: list[Mapping[str, Mapping[str, Any]]]) -> dict[str, float]:
+    """Return what `economy` said of frames, by light and bounce, as a report says it; empty if no rays were traced.
+
+    ``share`` is the root mean square of what leaving these rays out altogether would change of the light.
+    """
+    said: dict[str, float] = {}
+    for name in ("light", "bounce"):
+        keys = ("points", "rays", "left_out", "squares", "squares_of_most", "shares")
+        points, rays, left_out, *squares = (sum(one.get(name, {}).get(key, 0) for one in found) for key in keys)
+        if rays:
+            error, fewest, share = (float(np.sqrt(each / points)) for each in squares)
+            said[f"{name}_rays_per_gaussian"] = rays / points
+            said[f"{name}_rays_left_out"] = left_out
+            said[f"{name}_error"] = error
+            said[f"{name}_error_with_all_rays"] = fewest
+            said |= {"bounce_share": share} if name == "bounce" else {}
+    return said

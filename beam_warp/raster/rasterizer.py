@@ -129,6 +129,11 @@ class Rasterizer:
         """Number of (tile, splat) pairs there is room for."""
         return self._buffers.pair_capacity
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether the last `draw` took one band: only then `redraw` waits for nothing."""
+        return len(self._bands) <= 1
+
     def pair_count(self) -> int:
         """Return how many pairs the last frame has, or the last of its bands; waits for the device.
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reduction.changes import changed
 from beam_warp.reduction.merging import MergeOrder
+from beam_warp.reduction.pilot import fast_enough, images_a_second, steps_within
 from beam_warp.reduction.refit import refit
 from beam_warp.reduction.sensitivity import Sensitivity, measure_sensitivity
 from beam_warp.world.clusters import Clusters
@@ -33,6 +36,9 @@ SHARE = 0.95
 
 TRIED = 40
 """Draws of the search on which a candidate is judged: its worst is then beyond 98 % of all, as a rule."""
+
+GPU_STEPS, CPU_STEPS = 2880, 600
+"""Steps of a refit that is not told how many: in three seconds on an H200, every view is seen twenty times."""
 
 SAMPLE_FRAMES = 4
 """Frames, evenly over a sequence, that sensitivities are measured in."""
@@ -62,7 +68,12 @@ STEEPNESS = 1.1
 """Errors fall about with this power of the number of Gaussians, between 5 % and 50 % of them."""
 
 
-TARGETS = ("max_loss", "max_flip", "size", "gaussians")
+DRAWN = 8
+"""Draws of the search by which the time of an image is told."""
+
+TARGETS = ("max_loss", "max_flip", "target_error", "size", "gaussians", "target_fps")
+BOUNDS = {"max_loss": "loss", "max_flip": "flip", "target_error": "error"}
+"""Targets that bound an error, and its measure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,14 +83,18 @@ class ReduceOptions:
     Attributes:
         max_loss: Most loss against the truth by errors of the reduction [dB], see `beam_warp.evaluate.relit.loss_of`.
         max_flip: Most mean FLIP against the original, in (0, 1].
+        target_error: Largest root mean square error of display values against the original, in (0, 1].
         size: Most bytes of what is written.
         gaussians: Number of Gaussians.
+        target_fps: As many Gaussians as this device draws so often a second, under lights and cameras that change.
         asset_psnr: PSNR of the asset's relit images against the truth [dB], which ``max_loss`` is counted from.
         height: Side of the images that are compared [pixel]: the size at which the asset will be seen.
         pairs: Draws of a light, a camera and a frame that the certificate is made on.
         confidence: Of the certificate, in (0, 1).
-        views: Views on which sensitivities are measured, and which are refitted.
-        steps: Steps of a refit.
+        views: Views on which sensitivities are measured, and which are refitted: with few, these are learnt by heart.
+        steps: Steps of a refit; None takes `GPU_STEPS` or `CPU_STEPS`.
+        target_seconds: Longest time of the call [s], with ``gaussians``: refits take as many steps as it leaves.
+        spent: Part of that time that was spent before the call [s].
         seed: Same seed, same device: same result.
         raster: How splats are drawn; as the asset states without.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
@@ -90,14 +105,18 @@ class ReduceOptions:
 
     max_loss: float | None = None
     max_flip: float | None = None
+    target_error: float | None = None
     size: int | None = None
     gaussians: int | None = None
+    target_fps: float | None = None
     asset_psnr: float = ASSET_PSNR
     height: int = 256
     pairs: int = 200
     confidence: float = 0.95
-    views: int = 48
-    steps: int = 600
+    views: int = 144
+    steps: int | None = None
+    target_seconds: float | None = None
+    spent: float = 0.0
     seed: int = 0
     raster: RasterOptions | None = None
     device: Any = None
@@ -107,19 +126,27 @@ class ReduceOptions:
         given = [name for name in TARGETS if getattr(self, name) is not None]
         if len(given) != 1:
             raise InvalidOptionError(
-                f"target must be one of max-loss, max-flip, size and gaussians, got {len(given)}. Give one of them."
+                f"target must be one of {', '.join(TARGETS).replace('_', '-')}, got {len(given)}. Give one of them."
             )
-        for name, most in (("max_loss", 60.0), ("max_flip", 1.0)):
+        for name, most in (("max_loss", 60.0), ("max_flip", 1.0), ("target_error", 1.0), ("target_fps", 1e6)):
             if getattr(self, name) is not None:
                 require_number(name, getattr(self, name), 1e-6, most)
         for name in ("size", "gaussians"):
             if getattr(self, name) is not None:
                 require_count(name, getattr(self, name), 1, 2**40)
+        if self.target_seconds is not None:
+            require_number("target_seconds", self.target_seconds, 1e-9, 1e9)
+            if self.gaussians is None:
+                raise InvalidOptionError(
+                    f"target-seconds must go with gaussians, got {self.target.replace('_', '-')}, whose search "
+                    "takes as long as it needs. Ask for a number of Gaussians."
+                )
         require_number("asset_psnr", self.asset_psnr, 5.0, 100.0)
         require_count("pairs", self.pairs, 2, MOST_PAIRS)
         require_number("confidence", self.confidence, 0.5, 0.9999)
         require_count("views", self.views, 1, 1024)
-        require_count("steps", self.steps, 0, 100_000)
+        if self.steps is not None:
+            require_count("steps", self.steps, 0, 100_000)
         if self.bound is not None and not least_pairs(self.confidence) <= self.pairs:
             raise InvalidOptionError(
                 f"pairs must be at least {least_pairs(self.confidence)} for a bound that {SHARE:.0%} keep with "
@@ -129,7 +156,7 @@ class ReduceOptions:
     @property
     def measure(self) -> str:
         """Which error is bounded."""
-        return "flip" if self.max_flip is not None else "loss"
+        return BOUNDS.get(self.target, "loss")
 
     @property
     def target(self) -> str:
@@ -138,8 +165,8 @@ class ReduceOptions:
 
     @property
     def bound(self) -> float | None:
-        """The bound on the error; None if the target is a number of bytes or Gaussians."""
-        return self.max_loss if self.max_loss is not None else self.max_flip
+        """The bound on the error; None if the target is another one."""
+        return getattr(self, self.target) if self.target in BOUNDS else None
 
 
 def least_pairs(confidence: float) -> int:
@@ -163,6 +190,8 @@ class Reduction:
         original_count: Gaussians of the original.
         candidates: Numbers of Gaussians that were tried, and their errors on the search's half.
         error_scale: Factor of the bounds of delivery; None for other containers.
+        steps: Steps of its refit.
+        fps: Images a second that were drawn of what is written; None unless they were asked for.
     """
 
     count: int
@@ -171,10 +200,21 @@ class Reduction:
     original_count: int
     candidates: tuple[tuple[int, float], ...]
     error_scale: float | None
+    steps: int
+    fps: float | None = None
 
 
 class Reducer:
-    """Makes the reduced asset of any number of Gaussians; sensitivities are measured once."""
+    """Makes the reduced asset of any number of Gaussians; sensitivities are measured once.
+
+    Attributes:
+        original: The asset.
+        options: What is asked.
+        steps: Steps of a refit.
+        raster: How splats are drawn.
+        trials: The distribution of lights, cameras and frames.
+        sensitivity: What images depend on.
+    """
 
     def __init__(
         self,
@@ -197,6 +237,7 @@ class Reducer:
         """
         self.options, self._progress = options, progress
         self._device = resolve_device(options.device)
+        self.steps = (GPU_STEPS if self._device.is_cuda else CPU_STEPS) if options.steps is None else options.steps
         count = len(original)
         self._frames = sorted({int(frame) for frame in np.linspace(0, count - 1, SAMPLE_FRAMES).round()})
         self.original = original
@@ -220,7 +261,7 @@ class Reducer:
 
         Args:
             count: At most the original's; then it is the original, in the world's axes.
-            steps: Steps of the refit; as the options say without.
+            steps: Steps of the refit; as `steps` says without.
         """
         if count >= len(self):
             return replace(self.original, read_frame=lambda frame: world(self.original, frame))
@@ -229,10 +270,11 @@ class Reducer:
             frame: (clusters.cloud(cloud), clusters.motion(cloud)[0])
             for frame, cloud in zip(self._frames, self._clouds, strict=True)
         }
-        number = self.options.steps if steps is None else steps
+        number = self.steps if steps is None else steps
         how = {"raster": self.raster, "device": self._device, "progress": self._progress}
         changes = refit(merged, self.sensitivity, steps=number, **how)
 
+        @lru_cache(SAMPLE_FRAMES)
         def read(frame: int) -> GaussianCloud:
             cloud = world(self.original, frame)
             return changed(clusters.cloud(cloud), clusters.motion(cloud)[0], changes)
@@ -273,6 +315,7 @@ def reduce_asset(
         raise InvalidOptionError(f"out must be a file of USD or b4d, got {out.name}. Only these hold a certificate.")
     if options.measure == "flip":
         require_flip()
+    started = time.perf_counter()
     reducer = Reducer(original, environments, options, progress)
     how = {"raster": reducer.raster, "measure": options.measure, "device": options.device}
     how["asset_psnr"] = options.asset_psnr
@@ -280,6 +323,10 @@ def reduce_asset(
     with tempfile.TemporaryDirectory(prefix="beam_reduce_") as folder:
         search = _Search(reducer, comparison, Path(folder) / f"stored{out.suffix}")
         count, scale = search.target()
+        if options.target_seconds is not None:
+            spent, draws = options.spent + time.perf_counter() - started, TRIED + options.pairs
+            how = (comparison, search.timed, search.candidate, count, draws)
+            search.steps = steps_within(options.target_seconds, spent, *how)
         for attempt in range(TRIES):
             progress("certify", attempt, TRIES)
             stored = search.stored(count, scale)[0]
@@ -294,7 +341,8 @@ def reduce_asset(
             )
         final = replace(search.candidate(count), metadata={**original.metadata, **made.as_metadata()})
         paths = converters.write(final, out, _written_as(scale))
-    return Reduction(count, made, tuple(paths), len(reducer), tuple(search.tried), scale)
+        fps = None if options.target_fps is None else images_a_second(comparison, stored, search.timed)
+    return Reduction(count, made, tuple(paths), len(reducer), tuple(search.tried), scale, search.steps, fps)
 
 
 def _certified(
@@ -328,18 +376,20 @@ class _Search:
 
     def __init__(self, reducer: Reducer, comparison: RelitComparison, place: Path) -> None:
         self._reducer, self._comparison, self._place, self._options = reducer, comparison, place, reducer.options
+        self.steps = reducer.steps
         self.tried: list[tuple[int, float]] = []
         self._stored = 0
         self._made: dict[tuple[int, int], GaussianSequence] = {}
         start = 3 * reducer.options.views
         self._draws = reducer.trials.draw("search", range(start, start + TRIED), range(len(reducer.original)))
+        self.timed = self._draws[:DRAWN]
         self._delivers = format_of(place).name == "b4d"
 
     def candidate(self, count: int, steps: int | None = None) -> GaussianSequence:
         """Return the reduced asset of a number of Gaussians, made once."""
-        key = count, self._options.steps if steps is None else steps
+        key = count, self.steps if steps is None else steps
         if key not in self._made:
-            self._made[key] = self._reducer.reduced(count, steps=steps)
+            self._made[key] = self._reducer.reduced(count, steps=key[1])
         return self._made[key]
 
     def error(self, sequence: GaussianSequence) -> float:
@@ -366,6 +416,9 @@ class _Search:
             return min(options.gaussians, len(self._reducer)), 1.0 if self._delivers else None
         if options.size is not None:
             return self._within_size(options.size)
+        if options.target_fps is not None:
+            how = (self._comparison, self.timed, self.candidate, len(self._reducer))
+            return fast_enough(options.target_fps, *how), 1.0 if self._delivers else None
         assert options.bound is not None
         if not self._delivers:
             return self._fewest(options.bound), None

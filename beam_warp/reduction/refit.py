@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from beam_warp.device.arrays import upload
+from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.device.graphs import StepGraphs
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.kernels.reduction.changes import launch_change, launch_change_adjoint
 from beam_warp.raster.adam import Adam, Parameters
@@ -56,13 +58,25 @@ def refit(
     rates = RATES | {"shift": RATES["shift"] * float(np.median(np.sort(some.scales, axis=1)[:, 1]))}
     pairs = zip(MOVED, work.changes, work.slopes, strict=True)
     adam = Adam({name: Parameters(values, slopes, rates[name]) for name, values, slopes in pairs})
+    graphs = StepGraphs(resolve_device(device))
+
+    def take(view: int) -> None:
+        work.differentiate(view)
+        adam.step()
+
     for step in range(steps):
         if step % RATED_EVERY == 0:
             progress("refit", step, steps)
             for name, rate in rates.items():
                 adam.set_learning_rate(name, rate * LAST ** (step / steps))
-        work.differentiate(step % len(found.views))
-        adam.step()
+            if work.lacks_room():
+                work.make_room()
+                graphs.clear()
+        view = step % len(found.views)
+        if work.is_whole:
+            graphs.run(view, partial(take, view))
+        else:
+            take(view)
     return work.found()
 
 
@@ -72,6 +86,7 @@ class _Refit:
     Attributes:
         changes: As in `Changes`, in the order of `MOVED`.
         slopes: Derivatives of the error of one view to them.
+        is_whole: Whether every view is drawn in one go, so that a step may be recorded.
     """
 
     def __init__(
@@ -96,13 +111,32 @@ class _Refit:
         self._drawer = Rasterizer(count, cameras[:1], value_count=MATERIALS, options=raster, device=device)
         self._cameras = [self._drawer.prepare_cameras([camera]) for camera in cameras]
 
-    def differentiate(self, number: int) -> None:
-        """Find the slopes of the error of a view."""
-        view, drawer = self._views[number], self._drawer
-        merged = self._merged[view.frame]
-        drawer.set_cameras(self._cameras[number])
+        self.is_whole, self._has_room = True, False
+
+    def lacks_room(self) -> bool:
+        """Return whether the last view did not fit, or none was drawn yet."""
+        return not self._has_room or self._drawer.pair_count() > self._drawer.pair_capacity
+
+    def make_room(self) -> None:
+        """Draw every view as it is now, with as much room as it takes, some of it to spare."""
+        self.is_whole = self._has_room = True
+        for number in range(len(self._views)):
+            self._show(number)
+            self._drawer.draw(self._gaussians)
+            self.is_whole &= self._drawer.is_whole
+        self._drawer.backward()  # allocates what the way back needs, which a recording must not
+
+    def _show(self, number: int) -> tuple[wp.array, ...]:
+        """Take a view's camera, and change the Gaussians of its frame; return these as they were."""
+        self._drawer.set_cameras(self._cameras[number])
+        merged = self._merged[self._views[number].frame]
         launch_change(merged, self.changes, self._gaussians[:5], self._device)
-        view.slopes(drawer.draw(self._gaussians), drawer.adjoints())
+        return merged
+
+    def differentiate(self, number: int) -> None:
+        """Find the slopes of the error of a view; nothing waits for the device, if all views have room."""
+        drawer, merged = self._drawer, self._show(number)
+        self._views[number].slopes(drawer.redraw(), drawer.adjoints())
         gradients = drawer.backward()[:5]
         launch_change_adjoint(merged, self.changes, self._gaussians[:5], gradients, self.slopes, self._device)
 

@@ -46,8 +46,8 @@ COLUMNS = 9
 
 MATERIALS = COLUMNS - 1
 
-LIGHTS = 6
-"""Lights over which the matrices of a view are the mean."""
+LIGHTS = 2
+"""Lights over which the matrices of a view are the mean: what one pixel does not tell, those of other views do."""
 
 STEPS = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03, -0.02])
 """Differences by which shading is differentiated; alpha goes down, since it ends at 1."""
@@ -200,6 +200,7 @@ class _Meter:
         steps = wp.array(STEPS.astype(np.float32), dtype=float, device=device)
         views = wp.array(ViewLayout.of([camera]).views, dtype=RasterView, device=device)
         forms, edges = wp.zeros((len(covered), FORM), dtype=float, device=device), wp.zeros(count, float, device=device)
+        forms[:, FORM - 1].fill_(OTHER_BACKGROUNDS)
         shades = wp.zeros((COLUMNS + 1, count), dtype=wp.vec4, device=device)
         nudged = []
         for column, step in ((COLUMNS, 0.0), *enumerate(STEPS)):
@@ -209,13 +210,11 @@ class _Meter:
         share = 1.0 / len(lights)
         for light in lights:
             self._light(light)
+            arriving = self._arriving.scene_light()
             for row, drawn in enumerate(nudged):
-                launch_shade_gaussians(views, drawn, False, self._arriving.scene_light(), shades[row], device)
+                launch_shade_gaussians(views, drawn, False, arriving, shades[row], device)
             launch_add_forms(len(covered), pixels, shades, steps, share, forms, device)
             launch_add_edges(count, camera.width, camera.height, shades, share, edges, device)
-        own = forms.numpy()
-        own[:, -1] += OTHER_BACKGROUNDS
-        forms.assign(own)
         return forms, edges
 
     def _light(self, light: Trial) -> None:

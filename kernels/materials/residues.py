@@ -67,6 +67,7 @@ class GatheredLight:
     unshadowed: wp.array[wp.vec3]  # irradiance over pi with nothing in the way
     arriving: wp.array[wp.vec3]  # irradiance over pi through what is in the way
     bounce: wp.array[wp.vec3]  # irradiance over pi from what the rays hit
+    bounce_error: wp.array[float]  # standard error of the sum of its channels
     noise: wp.array[float]  # standard error of the arriving light over itself
     tilt: wp.array[float]  # change of the logarithm of the arriving light for each radian that the normal turns
 
@@ -92,6 +93,11 @@ class ColorFit:
     facing: wp.array[float]  # part of the weight of what was seen that was not seen grazing
 
 
+@wp.func
+def brightness(color: wp.vec3) -> float:
+    return color[0] + color[1] + color[2]
+
+
 @wp.kernel
 def trace_bounce_kernel(
     first: int,
@@ -101,16 +107,22 @@ def trace_bounce_kernel(
     gaussian_radiance: wp.array[wp.vec3],
     seed: wp.uint32,
     frame: wp.uint32,
-    sample_count: int,
-    out_irradiance: wp.array[wp.vec3],
+    counts: wp.array[int],
+    out_light: GatheredLight,
 ):
-    """Irradiance over pi from the captured radiance of what cosine-distributed rays hit: one bounce, already lit."""
+    """Irradiance over pi from the captured radiance of what cosine-distributed rays hit: one bounce, already lit.
+
+    Each row has its count of rays, at least 2. Its standard error takes them as independent.
+    """
     place = first + wp.tid()
+    row = batch.rows[place]
+    count = counts[row]
     basis = tangent_frame(batch.normals[place])
     origin = ray_origin(batch, place)
-    stream = hash_combine(stream_of(seed, frame, wp.uint32(batch.rows[place])), BOUNCE_STREAM)
+    stream = hash_combine(stream_of(seed, frame, wp.uint32(row)), BOUNCE_STREAM)
     total = wp.vec3()
-    for sample in range(sample_count):
+    squares = float(0.0)
+    for sample in range(count):
         direction = basis * square_to_cosine_hemisphere(
             unit_float(owen_sobol_x(sample, stream)), unit_float(owen_sobol_y(sample, stream))
         )
@@ -119,12 +131,11 @@ def trace_bounce_kernel(
         )
         if hit >= 0:
             total += gaussian_radiance[hit]
-    out_irradiance[batch.rows[place]] = total / float(sample_count)
-
-
-@wp.func
-def brightness(color: wp.vec3) -> float:
-    return color[0] + color[1] + color[2]
+            squares += brightness(gaussian_radiance[hit]) * brightness(gaussian_radiance[hit])
+    rays = float(count)
+    sum = brightness(total)
+    out_light.bounce[row] = total / rays
+    out_light.bounce_error[row] = wp.sqrt(wp.max(squares - sum * sum / rays, 0.0) / (rays * (rays - 1.0)))
 
 
 @wp.kernel
@@ -339,13 +350,13 @@ def sample_radiance_kernel(
         out_directions[view, row] = v
 
 
-def launch_trace_bounce(scene, settings, batch, gaussian_radiance, stream, sample_count, out_irradiance):
-    """Gather one bounce; ``stream`` is (seed, frame)."""
+def launch_trace_bounce(scene, settings, batch, gaussian_radiance, stream, counts, out_light):
+    """Gather one bounce by so many rays for each row; ``stream`` is (seed, frame)."""
     launch(
         trace_bounce_kernel,
         len(batch.rows),
-        inputs=[scene.occluders, settings, batch, gaussian_radiance, *map(wp.uint32, stream), sample_count],
-        outputs=[out_irradiance],
+        inputs=[scene.occluders, settings, batch, gaussian_radiance, *map(wp.uint32, stream), counts],
+        outputs=[out_light],
         device=scene.device,
         block_dim=64,
     )

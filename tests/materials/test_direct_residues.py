@@ -12,6 +12,7 @@ from support.shapes import cloud_of, disc_points, sphere_points, tiles
 from support.structures import filled
 
 from beam_warp import Scene
+from beam_warp.device.arrays import zero_struct
 from beam_warp.kernels.materials.residues import (
     ALBEDO_SCALING,
     FRESNEL_HV,
@@ -448,10 +449,12 @@ class TestBounce:
             base=scene.occluders.origin,
             sample_count=self.SAMPLES,
         )
-        out = wp.zeros(len(points), dtype=wp.vec3, device=device)
+        out = zero_struct(GatheredLight, len(points), device)
         sent = wp.array(np.float32(radiance), dtype=wp.vec3, device=device)
-        launch_trace_bounce(scene, EXACT.settings(scene), batch, sent, (seed, 0), self.SAMPLES, out)
-        return out.numpy()
+        counts = wp.full(len(points), self.SAMPLES, dtype=int, device=device)
+        launch_trace_bounce(scene, EXACT.settings(scene), batch, sent, (seed, 0), counts, out)
+        self.error = out.bounce_error.numpy()
+        return out.bounce.numpy()
 
     def test_a_disc_overhead_sends_its_radiance_times_its_form_factor(self, device):
         """R^2 / (R^2 + h^2) of a coaxial parallel disc; opaque tiles, several deep wherever a ray goes."""
@@ -466,6 +469,9 @@ class TestBounce:
         edge = 2.0 * spacing * radius * height**2 / (radius**2 + height**2) ** 2 * 1.0
         noise = LARGEST_Z * 0.5 / np.sqrt(self.SAMPLES)
         np.testing.assert_allclose(found / [1.0, 0.5, 2.0], 0.5, atol=edge + noise)
+        share = found[0]  # of rays that hit, all of the same radiance, whose channels add up to 3.5
+        independent = 3.5 * np.sqrt(share * (1.0 - share) / (self.SAMPLES - 1))
+        assert self.error[0] == pytest.approx(independent, rel=1e-3)
 
     def test_open_sky_bounces_nothing(self, device):
         disc = disc_points(0.5, 0.1) - np.array([0.0, 0.0, 1.0])

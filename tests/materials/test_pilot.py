@@ -46,6 +46,17 @@ def light_of(device, **options):
     return measured.light.arriving.numpy(), measured.light.noise.numpy(), measured.rays
 
 
+def bounce_of(device, **options):
+    """Bounced light of the upper half, its error over all light, and its rays; the moon glows more the further up."""
+    cloud, occluders, points, light = scene(device)
+    rows = np.flatnonzero(cloud.positions[:1200, 2] > 0.0)
+    measured = lit_points(cloud, points, np.full(1600, 0.5, np.float32), light, rows, None)
+    glow = np.repeat(np.exp(2.0 * cloud.positions[:, 2:]), 3, axis=1).astype(np.float32)
+    for _ in light_batches(occluders, points, light, measured, MaterialOptions(**options), glow, 0, lambda *_: None):
+        pass
+    return measured.light.bounce.numpy(), measured.bounce_noise(), measured.bounce_rays, measured.bounce_share()
+
+
 class TestHowMany:
     def test_a_point_at_the_target_gets_the_count(self):
         at_first = 0.05 * (64 / 16) ** RATE
@@ -85,10 +96,30 @@ def test_sets_go_on(device):
         np.testing.assert_array_equal(noise[rays == count], stated[rays == count])
 
 
+def test_rays_of_the_bounce_go_on(device):
+    """Who sees nothing but the sky gets the fewest rays, and rays of others are those of a longer set, bit for bit."""
+    value, noise, rays, share = bounce_of(device, light_error=0.05)
+    assert set(rays) == {4, 8, 16, 32, 64}
+    assert share[rays == 4].mean() < 0.1 * share[rays == 64].mean()
+    for count in (8, 32):
+        fixed, _, every, _ = bounce_of(device, light_error=0.0, sample_count=4 * count)
+        assert (every == count).all()
+        np.testing.assert_array_equal(value[rays == count], fixed[rays == count])
+    assert np.isfinite(noise).all()
+
+
+def test_the_bounce_stays_unbiased(device):
+    truth = bounce_of(device, light_error=0.0, sample_count=4096, seed=1000)[0].sum(axis=1)
+    errors = [bounce_of(device, light_error=0.1, seed=seed)[0].sum(axis=1) - truth for seed in range(6)]
+    require_zero_mean(np.concatenate(errors))
+
+
 @pytest.mark.parametrize("way", [{"sampler": "stratified"}, {"density": "mis"}, {"light_error": 0.0}])
 def test_sets_that_do_not_go_on_take_as_many_each(way):
     assert MaterialOptions(**way).light_rays == (64, 64)
+    assert MaterialOptions(**way).bounce_rays == (16, 16)
     assert MaterialOptions(sample_count=4).light_rays == (4, 16)
+    assert MaterialOptions(sample_count=4).bounce_rays == (4, 8)
 
 
 def test_means_stay_unbiased_where_stopping_would_not(device):
@@ -111,11 +142,14 @@ def test_means_stay_unbiased_where_stopping_would_not(device):
 def test_what_was_left_out_adds_up_over_frames():
     one = economy(np.array([0.1, 0.2]), np.array([16, 256]), 256)
     two = economy(np.array([0.4]), np.array([64]), 256)
-    found = summary([one, {}, two])
+    found = summary([{"light": one}, {}, {"light": two}])
     assert found["light_rays_per_gaussian"] == (16 + 256 + 64) / 3
     assert found["light_rays_left_out"] == 240 + 192
     assert found["light_error"] == pytest.approx(np.sqrt((0.01 + 0.04 + 0.16) / 3))
     eighth = 16.0 ** (-2.0 * RATE), 4.0 ** (-2.0 * RATE)
     expected = np.sqrt((0.01 * eighth[0] + 0.04 + 0.16 * eighth[1]) / 3)
     assert found["light_error_with_all_rays"] == pytest.approx(expected)
+    assert not any("bounce" in name for name in found)
+    both = summary([{"light": one, "bounce": economy(np.array([0.1]), np.array([4]), 64, share=np.array([0.02]))}])
+    assert (both["bounce_rays_left_out"], both["bounce_share"]) == (60, pytest.approx(0.02))
     assert summary([{}]) == {}

@@ -22,6 +22,7 @@ from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reduction import job
 from beam_warp.reduction.job import ReduceOptions, Reducer, reduce_asset
+from beam_warp.reduction.refit import refit
 from beam_warp.reduction.sensitivity import LIGHTS as EACH
 from beam_warp.reduction.sensitivity import MATERIALS, material_rows
 from beam_warp.render.deferred import DeferredRenderer
@@ -147,7 +148,7 @@ def test_a_size_is_kept(tmp_path, few_draws):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("target", [{"max_loss": 6.0}, {"max_flip": 0.1}])
+@pytest.mark.parametrize("target", [{"max_loss": 6.0}, {"max_flip": 0.1}, {"target_error": 0.06}])
 def test_a_certified_bound_holds_on_fresh_draws(target, tmp_path):
     original = ball(600)
     options = ReduceOptions(**target, height=48, views=16, steps=60, pairs=120, device="cpu")
@@ -186,11 +187,33 @@ def test_what_cannot_be_attained_is_refused_with_the_nearest_that_can(tmp_path, 
         {"max_loss": float("nan")},
         {"size": 0},
         {"max_loss": 1.0, "pairs": 20},
+        {"target_error": 0.0},
+        {"target_error": 0.1, "target_fps": 30.0},
+        {"target_fps": 0.0},
+        {"gaussians": 3, "target_seconds": 0.0},
     ],
 )
 def test_targets_that_mean_nothing_are_refused(targets):
     with pytest.raises(InvalidOptionError, match="must be"):
         ReduceOptions(**targets)
+
+
+def test_a_time_goes_with_a_number_of_gaussians():
+    with pytest.raises(InvalidOptionError, match="target-seconds must go with gaussians, got max-loss"):
+        ReduceOptions(max_loss=1.0, target_seconds=60.0)
+
+
+def test_times_choose_gaussians_and_steps(few_draws, tmp_path, monkeypatch):
+    """What is drawn so often is said as it was reached; steps of the refit are those that fit."""
+    fast = reduce_asset(ball(), LIGHTS, replace(QUICK, gaussians=None, target_fps=1e-3), tmp_path / "fast.usda")
+    assert fast.count == 300
+    assert fast.fps is not None
+    assert fast.fps > 1e-3
+    monkeypatch.setattr(job, "steps_within", lambda seconds, spent, *_: 3 if spent > 7.0 else 0)
+    steps = []
+    monkeypatch.setattr(job, "refit", lambda *given, **how: steps.append(how["steps"]) or refit(*given, **how))
+    found = reduce_asset(ball(), LIGHTS, replace(QUICK, target_seconds=1e3, spent=7.0), tmp_path / "timed.usda")
+    assert set(steps) == {found.steps} == {3}
 
 
 @pytest.mark.parametrize(("text", "count"), [("20MB", 20_000_000), ("1.5 kb", 1500), ("7", 7)])
