@@ -1,6 +1,6 @@
 """A storm of kills: takes of 20 frames whose workers, machines and drivers are killed at random, whatever they are at.
 
-    python benchmarks/kills.py [--quick] [--steps toy|real] [--kills N] [--seed N] --out result.json
+    python benchmarks/kills.py [--quick] [--steps toy|real] [--device D] [--kills N] [--seed N] --out result.json
 
 - ``processes``: a driver with three processes, and the server that these are forked from; one of the five is killed,
   again and again.
@@ -58,11 +58,12 @@ PATHS = os.pathsep.join(filter(None, [str(record.ROOT / "tests"), os.environ.get
 
 @dataclass
 class Bench:
-    """How many are killed at least, and at which kind of steps."""
+    """How many are killed at least, at which kind of steps, and on which device these are done."""
 
     kills: int
     seed: int
     steps: str
+    device: str
 
 
 def begun(out: Path) -> list[str]:
@@ -75,7 +76,7 @@ def storm(bench: Bench, workers: str, kill: Kill) -> Iterator[Row]:
     rng, killed, at, takes, executions, steps = random.Random(bench.seed), Counter[str](), Counter[str](), 0, 0, 0
 
     def drive(number: int, out: Path, words: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-P", "-c", DRIVER, bench.steps, str(number), str(out), words]
+        command = [sys.executable, "-P", "-c", DRIVER, bench.steps, str(number), str(out), words, bench.device]
         return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": PATHS})
 
     def undisturbed(number: int, out: Path) -> int:
@@ -88,7 +89,7 @@ def storm(bench: Bench, workers: str, kill: Kill) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as name:
         place, kinds = Path(name), len(TAKES[bench.steps])
         if bench.steps == "real":
-            draw_capture(place / "capture")
+            draw_capture(place / "capture", bench.device)
         whole = [place / f"whole {number}" for number in range(kinds)]
         for number, out in enumerate(whole):
             out.mkdir()
@@ -195,13 +196,13 @@ PARTS = {"processes": processes, "cluster": cluster}
 
 def main() -> None:
     """Kill, and write the result after every take."""
-    parser = record.parser(__doc__, quick="four kills, to see whether it runs", parts=PARTS)
+    parser = record.parser(__doc__, device="cpu", quick="four kills, to see whether it runs", parts=PARTS)
     parser.add_argument("--kills", type=int, default=100, help="at least, in each part")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", choices=TAKES, default="toy", help="steps that nap, or all of beam run, small")
     arguments = parser.parse_args()
-    bench = Bench(4 if arguments.quick else arguments.kills, arguments.seed, arguments.steps)
-    keep = functools.partial(record.write_result, arguments, resolve_device("cpu"))
+    bench = Bench(4 if arguments.quick else arguments.kills, arguments.seed, arguments.steps, arguments.device)
+    keep = functools.partial(record.write_result, arguments, resolve_device(arguments.device))
     measure(PARTS, bench, only=arguments.parts, keep=keep)
 
 

@@ -1,7 +1,9 @@
-"""A capture at full resolution for the reconstruction benchmark: a known moving surface with a texture of its own.
+"""Captures for the benchmarks of reconstruction, path traced by the package itself.
 
-The texture is a function of where a point is in the first frame, so that it stays with the surface; the mesh is
-subdivided until its vertices are as dense as pixels. Path traced by the package itself.
+`write_large_capture` shows a known moving surface at full resolution. Its texture is a function of where a point is in
+the first frame, so that it stays with the surface; the mesh is subdivided until its vertices are as dense as pixels.
+`write_walking_capture` shows the walker's model for longer than its own capture does, with or without a case in its
+hand that is put down.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from walking_take import FRAMES_PER_SECOND, START, SkinnedModel
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import DomeCamera, dome_cameras, write_capture
@@ -23,6 +26,22 @@ FloatArray = NDArray[np.float64]
 
 SEED = 11
 
+CASE = (0.12, 0.30, 0.54)
+"""Sides of the case [m]."""
+
+CASE_ASIDE, CASE_BELOW = 0.08, 0.03
+"""Distance of the middle of the case outwards of the hand, and of its top below it [m]: so the leg swings past it."""
+
+PUT_DOWN = 8
+"""Frame in which the hand lets go of the case, at the end of its swing: it falls 0.2 m, straight down, and stays."""
+
+GRAVITY = 9.81
+
+ROUGHNESS = 0.6
+"""Roughness of the walking model."""
+
+RIGHT_HAND = "Skeleton_arm_joint_R__3_"
+
 WAVES = ((0.40, 6), (0.12, 8), (0.035, 10), (0.011, 12))
 """Wavelengths of the texture [m] and how many waves of each: from clothes to stitches."""
 
@@ -33,29 +52,27 @@ def textured_meshes(
     """Return the true surfaces of some frames with a texture, subdivided, and as they were, vertices and faces."""
     known = [read_truth_mesh(source, frame) for frame in frames]
     faces = np.asarray(known[0].faces, np.int64)
-    plans = []
-    count = len(known[0].vertices)
-    fine = faces
-    for _ in range(subdivisions):
-        edges, fine = halved(fine, count)
-        plans.append(edges)
-        count += len(edges)
+    plans, fine = subdivided(faces, len(known[0].vertices), subdivisions)
     rest = refined(np.asarray(known[0].vertices, np.float64), plans)
     color, roughness = texture(rest)
     meshes = []
     for mesh in known:
         vertices = np.asarray(mesh.vertices, np.float64)
         normals = refined(vertex_normals(vertices, faces), plans)
-        meshes.append(
-            MaterialMesh(
-                vertices=refined(vertices, plans),
-                faces=fine,
-                normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
-                base_color=color,
-                roughness=roughness,
-            )
-        )
+        meshes.append(_mesh(refined(vertices, plans), fine, normals, color, roughness))
     return meshes, [(np.asarray(mesh.vertices, np.float64), faces) for mesh in known]
+
+
+def subdivided(
+    faces: NDArray[np.int64], vertex_count: int, times: int
+) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
+    """Return the plans that `refined` takes, and the triangles, each cut into four so many times."""
+    plans = []
+    for _ in range(times):
+        edges, faces = halved(faces, vertex_count)
+        plans.append(edges)
+        vertex_count += len(edges)
+    return plans, faces
 
 
 def halved(faces: NDArray[np.int64], vertex_count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -115,4 +132,107 @@ def write_large_capture(
     )
     return write_capture(
         folder, meshes, cameras, light, surfaces=surfaces, samples=samples, device=device, progress=progress
+    )
+
+
+def write_walking_capture(
+    folder: Path,
+    model: SkinnedModel,
+    light: EnvironmentMap,
+    *,
+    frame_count: int,
+    case: bool,
+    camera_count: int = 24,
+    test_camera_count: int = 2,
+    size: int = 320,
+    samples: int = 32,
+    subdivisions: int = 2,
+    device: str | None = None,
+) -> Capture:
+    """Path trace the walker's model for a dome of cameras and write it as a capture.
+
+    Args:
+        folder: Where to.
+        model: That of the capture, with its own texture.
+        light: What it stands in.
+        frame_count: Frames, of which the walker has 24 a second.
+        case: Whether a case is carried in the right hand until it is `PUT_DOWN`.
+        camera_count: Training cameras.
+        test_camera_count: Cameras with truth.
+        size: Side of every image [pixel].
+        samples: Paths of a pixel.
+        subdivisions: Times that triangles of the model, of 30 mm, are cut into four.
+        device: Warp device.
+    """
+    posed = [model.posed(START + frame) for frame in range(frame_count)]
+    edges, faces = subdivided(model.faces, len(model.vertices), subdivisions)
+    color = model.base_color(refined(model.texture_places, edges))
+    rough = np.full(len(color), ROUGHNESS)
+    _, first, place = np.unique(model.vertices, axis=0, return_index=True, return_inverse=True)
+    meshes = []
+    for vertices in posed:  # vertices at one place, cut apart where the texture is, have one normal
+        normals = vertex_normals(vertices[first], place[model.faces])[place]
+        meshes.append(_mesh(refined(vertices, edges), faces, refined(normals, edges), color, rough))
+    if case:
+        hand = model.weights[:, model.joint(RIGHT_HAND)] > 0.5
+        places = case_places(np.stack([vertices[hand].mean(axis=0) for vertices in posed]))
+        corners, sides = box(CASE)
+        cuts, sides = subdivided(sides, len(corners), subdivisions + 3)
+        corners = refined(corners, cuts)
+        looks = texture(corners)
+        upright = vertex_normals(corners, sides)
+        meshes = [
+            joined(mesh, _mesh(corners + place, sides, upright, *looks))
+            for mesh, place in zip(meshes, places, strict=True)
+        ]
+    cameras = dome_cameras([mesh.vertices for mesh in meshes], camera_count, test_camera_count, size, size)
+    return write_capture(folder, meshes, cameras, light, samples=samples, device=device)
+
+
+def case_places(hand: FloatArray) -> FloatArray:
+    """Return the middle of the case in every frame, ``(F, 3)``: carried upright, then falling, then on the floor.
+
+    Args:
+        hand: Middle of the hand in every frame, ``(F, 3)`` [m].
+    """
+    held = hand - (CASE_ASIDE, 0.0, CASE_BELOW + 0.5 * CASE[2])
+    fallen = np.maximum(np.arange(len(hand)) - PUT_DOWN, 0) / FRAMES_PER_SECOND
+    down = held[np.minimum(np.arange(len(hand)), PUT_DOWN)]
+    down[:, 2] = np.maximum(down[:, 2] - 0.5 * GRAVITY * fallen**2, 0.5 * CASE[2])
+    return down
+
+
+def box(sides: tuple[float, float, float]) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return corners around the origin, each once for each of its three faces, and triangles of a box."""
+    corners, faces = [], []
+    for axis in range(3):
+        one, two = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (-1.0, 1.0):
+            start = len(corners)
+            for a, b in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)):
+                corner = np.zeros(3)
+                corner[[axis, one, two]] = sign, sign * a, b
+                corners.append(0.5 * corner * sides)
+            faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
+    return np.stack(corners), np.array(faces)
+
+
+def joined(one: MaterialMesh, other: MaterialMesh) -> MaterialMesh:
+    """Return two meshes as one."""
+    arrays = {
+        name: np.concatenate([getattr(one, name), getattr(other, name)])
+        for name in ("vertices", "normals", "base_color", "roughness")
+    }
+    return MaterialMesh(faces=np.concatenate([one.faces, other.faces + len(one.vertices)]), **arrays)
+
+
+def _mesh(
+    vertices: FloatArray, faces: NDArray[np.int64], normals: FloatArray, color: FloatArray, roughness: FloatArray
+) -> MaterialMesh:
+    return MaterialMesh(
+        vertices=vertices,
+        faces=faces,
+        normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        base_color=color,
+        roughness=roughness,
     )

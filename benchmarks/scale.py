@@ -2,13 +2,13 @@
 
     python benchmarks/scale.py [--quick] [--parts PART] --out result.json
 
-- ``constants``: seconds of a step by stage, from results that were measured on a GPU (`RECONSTRUCTED`, `DECOMPOSED`);
+- ``constants``: seconds of a step by stage, while as many processes share a GPU as make most frames an hour (`WORKED`);
   and of writing an asset, measured here on one core, of clouds in which everything varies: surveying a frame, its part
   of a clip, and what is left at the end.
 - ``takes``: the plan that ``beam run`` makes of 18,000 frames, handed out by the schedule that carries it out.
 - ``check``: a take of steps that sleep, carried out by processes of this machine, beside its simulation.
 
-Steps that are made once, and previews, take no time in ``takes``: nobody has measured them for such a take.
+Steps that are made once take no time in ``takes``.
 """
 
 from __future__ import annotations
@@ -46,14 +46,17 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
 Row = dict[str, Any]
 
-RECONSTRUCTED, DECOMPOSED = "reconstruction_h200.json", "materials_cost_h200.json"
+WORKED = "workers_h200.json"
+MEASURED = {"key_frame": "key frame", "tracked_frame": "frame", "materials": "materials", "preview": "preview"}
+"""Kinds of steps in that result, by the names that they have here."""
+
 ASSETS = ("gaussians", "asset")
 """Assets that a take becomes: what was reconstructed, and what can be relit. Both are charged as the larger one."""
 
 FADED = 2.0
 """Gaussians of a frame where two segments overlap, over those of one."""
 
-FRAMES, WORKERS, SEGMENTS = 18_000, (1, 2, 8, 64, 256, 1024), (30, 120)
+FRAMES, GPUS, SEGMENTS = 18_000, (1, 2, 8, 64, 256, 1024), (30, 120)
 
 
 @dataclass
@@ -136,17 +139,14 @@ def _random_cloud(count: int, seed: int) -> GaussianCloud:
 
 def constants(bench: Bench) -> Iterator[Row]:
     """Seconds a step, by stage; of a key frame and a tracked one."""
-    known = {
-        name: json.loads((record.RESULTS / name).read_text(encoding="utf-8")) for name in (RECONSTRUCTED, DECOMPOSED)
-    }
-    key, tracked = (known[RECONSTRUCTED]["large"]["frames"][k]["seconds"] for k in (0, 1))
-    materials = known[DECOMPOSED]["cost"]["direct, with roughness"]["seconds"]["median"]
+    known = json.loads((record.RESULTS / WORKED).read_text(encoding="utf-8"))
+    best = max(known["take"]["rows"], key=lambda row: row["frames_per_hour_a_gpu"])
+    seconds = {name: best["steps"][kind]["median"] for name, kind in MEASURED.items()}
     yield {
-        "key_frame": key,
-        "tracked_frame": tracked,
-        "materials": materials,
+        "processes": best["workers"] // best["gpus"],
+        "seconds": seconds,
         "written": bench.written_frame,
-        "devices": sorted({content["measured"]["machine"]["device"] for content in known.values()}),
+        "device": known["measured"]["machine"]["device"],
     }
 
 
@@ -176,17 +176,17 @@ def as_stages(steps: tuple[Step, ...]) -> tuple[Step, ...]:
 
 
 def takes(bench: Bench) -> Iterator[Row]:
-    """Hours, GPU hours and efficiency of a take, by workers; also were its assets written by one process at the end."""
+    """Hours, GPU hours and efficiency of a take, by GPUs; also were its assets written by one process at the end."""
     (known,) = constants(bench)
-    written = known["written"]
+    written, measured = known["written"], known["seconds"]
     survey, clip = (CLIP_FRAMES * written[name] for name in ("survey", "clip"))
     seconds = {
-        "key_frame": known["key_frame"],
-        **dict.fromkeys(("frame", "seam"), known["tracked_frame"]),
-        "materials": known["materials"],
-        "faded_materials": FADED * known["materials"],
+        "key_frame": measured["key_frame"],
+        **dict.fromkeys(("frame", "seam"), measured["tracked_frame"]),
+        "materials": measured["materials"],
+        "faded_materials": FADED * measured["materials"],
         "light": 0.0,
-        "preview": 0.0,
+        "preview": measured["preview"],
         **{f"{asset}-{stage}": spent for asset in ASSETS for stage, spent in (("survey", survey), ("clip", clip))},
         **{f"{asset}-whole": 0.0 for asset in ASSETS},
     }
@@ -197,18 +197,20 @@ def takes(bench: Bench) -> Iterator[Row]:
         work = sum(seconds[step.stage] for step in frames)
         serial = len(ASSETS) * bench.frames * (written["survey"] + written["clip"])
         end = len(ASSETS) * written["end"]
-        for workers in WORKERS:
+        for gpus in GPUS:
+            workers = gpus * known["processes"]
             spent = simulated(steps, (), seconds, workers) + end
             alone = simulated(frames, (), seconds, workers) + serial + end
             rows.append(
                 {
-                    "name": f"{workers} x {segment}",
+                    "name": f"{gpus} x {segment}",
+                    "gpus": gpus,
                     "workers": workers,
                     "segment": segment,
                     "hours": spent / 3600.0,
                     "busy_hours": work / 3600.0,
                     "efficiency": work / (workers * spent),
-                    "frames_per_hour_a_worker": bench.frames / (spent / 3600.0) / workers,
+                    "frames_per_hour_a_gpu": bench.frames / (spent / 3600.0) / gpus,
                     "hours_written_by_one": alone / 3600.0,
                     "efficiency_written_by_one": work / (workers * alone),
                 }

@@ -74,7 +74,8 @@ def named(result: Row) -> Rows:
 
 def _words(flaw: str, size: float) -> str:
     """Return what is wrong, in words."""
-    words = WORDS.get(flaw) or "; ".join(FLAWS[part] for part in flaw.split("+"))
+    *others, last = flaw.split("+")
+    words = WORDS.get(flaw) or (f"{', '.join(others)} and {last} at once" if others else FLAWS[last])
     return ", ".join(filter(None, (words, TIMES.get(size, f"times {size:g}"))))
 
 

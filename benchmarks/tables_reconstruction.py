@@ -1,4 +1,4 @@
-"""Tables and figure of the pages on reconstruction and tracking, from the results of `reconstruction.py`."""
+"""Tables and figure of the pages on reconstruction and tracking, from `reconstruction.py` and `steady_take.py`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from tables import Row, Rows, cell, figure, number, table
 MAIN = "reconstruction_h200.json"
 CHOICES = "reconstruction_choices_h200.json"
 STRIDES = "reconstruction_strides_cpu.json"
+WALK, WITH_CASE = "steady_walk_h200.json", "steady_case_h200.json"
 EXPOSURES = "exposures_cpu.json"
 
 MEASURES: tuple[tuple[str, Callable[[Row], float]], ...] = (
@@ -157,6 +158,44 @@ def strides(result: Row) -> Rows:
                 *(f"{drift[key]:.1f} mm" for key in ("mean_mm", "p95_mm")),
             ]
         )
+    return found
+
+
+@table("tracking_take", WALK, WITH_CASE)
+def take(walk: Row, with_case: Row) -> Rows:
+    """Return how frames of a second hold: drift since the key frame, scores, and what was lost."""
+    heads = ("lost", "drift", "in pixels", "95 % below", "novel views [dB]", "occlusion [dB]", "base colour [dB]")
+    found: list[list[Any]] = [["", "frame", *heads]]
+    for words, part in (("walk", walk["walk"]), ("with a case", with_case["case"])):
+        frames, pixel = part["frames"], part["pixel_mm"]["median"]
+        last = len(frames) - 1
+        for index in (0, 1, last // 3, 2 * last // 3, last):
+            row = frames[index]
+            drift = row["drift"]["vertices"]
+            lengths = (f"{drift['mean_mm']:.1f} mm", f"{drift['mean_mm'] / pixel:.2f}", f"{drift['p95_mm']:.1f} mm")
+            found.append(
+                [
+                    words,
+                    f"{row['frame']}",
+                    f"{sum(bool(entry['lost']) for entry in frames[: index + 1])}",
+                    *(("", "", "") if row["kind"] == "key" else lengths),
+                    *(f"{row[channel]:.1f}" for channel in ("novel_view", "ambient_occlusion", "base_color")),
+                ]
+            )
+    return found
+
+
+@table("tracking_flicker", WALK, WITH_CASE)
+def flicker(walk: Row, with_case: Row) -> Rows:
+    """Return the flicker of both channels over a second, per Gaussian and at points of the surface."""
+    heads = ("per Gaussian", "95 % below", "at points of the surface", "95 % below", "the truth there", "error there")
+    found: list[list[Any]] = [["", "", *heads]]
+    for words, scores in (("walk", walk["walk"]["temporal"]), ("with a case", with_case["case"]["temporal"])):
+        for channel, prefix in (("base colour", ""), ("ambient occlusion", "occlusion_")):
+            gaussians, surface = scores[f"{prefix}gaussians"], scores[f"{prefix}surface"]
+            cells = [None if gaussians is None else gaussians[key] for key in ("mean", "p95")]
+            cells += [surface["ours"]["mean"], surface["ours"]["p95"], surface["truth"]["mean"], surface["error"]]
+            found.append([words, channel, *(cell(value, ".4f") for value in cells)])
     return found
 
 

@@ -18,11 +18,11 @@ def takes(result: Row) -> Rows:
         head,
         *(
             [
-                f"{row['workers']:,}",
+                f"{row['gpus']:,}",
                 row["segment"],
                 cell(row["hours"], ".1f"),
                 f"{row['efficiency']:.0%}",
-                cell(row["frames_per_hour_a_worker"], ".0f"),
+                cell(row["frames_per_hour_a_gpu"], ".0f"),
                 f"{cell(row['hours_written_by_one'], '.1f')} h, {row['efficiency_written_by_one']:.0%}",
             ]
             for row in result["takes"]["rows"]
@@ -45,33 +45,52 @@ def asset_gigabytes(result: Row) -> float:
     return result["takes"]["frames"] * result["constants"]["written"]["bytes"] / 1e9
 
 
-@table("scale_kills", "kills_real_cpu.json", "kills_processes_cpu.json", "kills_cluster_cpu.json")
-def kills(real: Row, processes: Row, cluster: Row) -> Rows:
+@table("scale_kills", "kills_real_cpu.json", "kills_real_h200.json", "kills_real_cluster_cpu.json")
+def kills(on_cpu: Row, on_gpu: Row, cluster: Row) -> Rows:
     """Return how many were killed in takes of 20 frames that are whole, and what that cost."""
-    rows: list[list[Any]] = [["", "steps", "killed are", "kills", "takes", "executions of a step"]]
-    for name, steps, who, found in (
-        ("three processes", "real ones, small", "processes, their server, drivers", real["processes"]),
-        ("three processes", "naps", "processes, drivers", processes["processes"]),
-        ("Ray cluster of three machines", "naps", "actors, machines, drivers", cluster["cluster"]),
+    kinds = {
+        "worker": ("worker",),
+        "server": ("server",),
+        "raylet": ("raylet",),
+        "driver": ("driver", "driver at the end"),
+    }
+    rows: list[list[Any]] = [["", "kills", *(f"of a {kind}" for kind in kinds), "takes", "executions of a step"]]
+    for name, found in (
+        ("three processes, two CPU cores", on_cpu["processes"]),
+        ("three processes, one H200", on_gpu["processes"]),
+        ("Ray cluster of three machines, two CPU cores", cluster["cluster"]),
     ):
-        rows.append([name, steps, who, found["kills"], found["takes"], f"{found['executions'] / found['steps']:.2f}"])
+        counts = [sum(found["killed"].get(name, 0) for name in names) or "" for names in kinds.values()]
+        rows.append([name, found["kills"], *counts, found["takes"], f"{found['executions'] / found['steps']:.2f}"])
     return rows
 
 
+@table("scale_workers_shared", "workers_h200.json")
 @table("scale_workers", "workers_h200x2.json")
 def workers(result: Row) -> Rows:
-    """Return what a take costs one process and one on each GPU, and how long each kind of step takes."""
-    kinds = ("frame", "materials", "preview")
+    """Return what a take costs processes on GPUs, and how long each kind of step takes."""
+    kinds = {"key frame": "key frame", "frame": "tracked frame", "materials": "materials", "preview": "preview"}
     rows: list[list[Any]] = [
-        ["GPUs", "seconds of steps", "busy", "frames an hour a GPU", "efficiency", *(f"{kind} [s]" for kind in kinds)]
+        [
+            "GPUs",
+            "processes",
+            "seconds of steps",
+            "busy",
+            "frames an hour a GPU",
+            "efficiency",
+            *(f"{kind} [s]" for kind in kinds.values()),
+        ]
     ]
     for row in result["take"]["rows"]:
+        row = {"gpus": row["workers"], **row}
+        row["steps"] = {"key frame": row["steps"]["frame"], **row["steps"]}
         rows.append(
             [
+                row["gpus"],
                 row["workers"],
                 cell(row["working"], ".1f"),
                 f"{row['busy']:.0%}",
-                cell(row["frames_per_hour_a_worker"], ".0f"),
+                cell(row.get("frames_per_hour_a_gpu") or row["frames_per_hour_a_worker"], ".0f"),
                 f"{row.get('efficiency', 1.0):.0%}",
                 *(cell(row["steps"][kind]["median"], ".1f") for kind in kinds),
             ]

@@ -6,17 +6,21 @@ The capture ``walker`` shows CesiumMan, a glTF model of 19 joints that walks for
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from beam_warp.image.color import srgb_to_linear
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
@@ -52,9 +56,12 @@ class SkinnedModel:
         content = path.read_bytes()
         (length,) = struct.unpack_from("<I", content, 12)
         self._facts, self._binary = json.loads(content[20 : 20 + length]), content[28 + length :]
-        attributes = self._facts["meshes"][0]["primitives"][0]["attributes"]
+        primitive = self._facts["meshes"][0]["primitives"][0]
+        attributes = primitive["attributes"]
         self.vertices = self._rows(attributes["POSITION"])
         self.normals = self._rows(attributes["NORMAL"])
+        self.texture_places = self._rows(attributes["TEXCOORD_0"])
+        self.faces = self._rows(primitive["indices"]).astype(np.int64).reshape(-1, 3)
         count, joints = len(self.vertices), self._rows(attributes["JOINTS_0"]).astype(int)
         self.weights = np.zeros((count, len(self._facts["skins"][0]["joints"])))
         np.add.at(self.weights, (np.arange(count)[:, None], joints), self._rows(attributes["WEIGHTS_0"]))
@@ -63,10 +70,39 @@ class SkinnedModel:
         accessor = self._facts["accessors"][number]
         view = self._facts["bufferViews"][accessor["bufferView"]]
         width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
-        kind = {5123: np.dtype("<u2"), 5126: np.dtype("<f4")}[accessor["componentType"]]
+        kind = {5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}[accessor["componentType"]]
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         strides = view.get("byteStride", width * kind.itemsize), kind.itemsize
         return np.ndarray((accessor["count"], width), kind, self._binary, start, strides).astype(np.float64)
+
+    def joint(self, name: str) -> int:
+        """Return the column of `weights` of the joint of a name."""
+        nodes = [self._facts["nodes"][node]["name"] for node in self._facts["skins"][0]["joints"]]
+        return nodes.index(name)
+
+    def base_color(self, places: FloatArray) -> FloatArray:
+        """Return the texture, scene-linear, of the texels next to texture coordinates ``(N, 2)``, ``(N, 3)``."""
+        view = self._facts["bufferViews"][self._facts["images"][0]["bufferView"]]
+        start = view.get("byteOffset", 0)
+        image = np.asarray(Image.open(io.BytesIO(self._binary[start : start + view["byteLength"]])).convert("RGB"))
+        height, width = image.shape[:2]
+        column, row = (np.floor(places * (width, height)).astype(int) % (width, height)).T
+        return srgb_to_linear(image[row, column] / 255.0)
+
+    def posed(self, key: int) -> FloatArray:
+        """Return the vertices at a key, in the capture's world, ``(V, 3)`` [m]."""
+        middle, to_model = self.floor
+        return (_moved(self._blended(key), self.vertices) - middle) / to_model
+
+    @cached_property
+    def floor(self) -> tuple[FloatArray, float]:
+        """Return the model's place of the capture's origin, and its length of a metre."""
+        posed = _moved(self._blended(START), self.vertices)
+        middle = 0.5 * (posed.min(axis=0) + posed.max(axis=0)) * [1.0, 1.0, 0.0] + [0.0, 0.0, posed[:, 2].min()]
+        return middle, float(np.ptp(posed[:, 2])) / HEIGHT
+
+    def _blended(self, key: int) -> FloatArray:
+        return np.einsum("nj,jkl->nkl", self.weights, self.joints(key))
 
     def joints(self, key: int) -> FloatArray:
         """Return the matrices that take vertices at rest to where each joint has them at a key, ``(J, 4, 4)``."""
@@ -106,8 +142,7 @@ def walk(first: GaussianCloud, model: SkinnedModel, frames: int) -> Iterator[Gau
     rng, start = np.random.default_rng(0), model.joints(START)
     blended = np.einsum("nj,jkl->nkl", model.weights, start)
     posed = _moved(blended, model.vertices)
-    middle = 0.5 * (posed.min(axis=0) + posed.max(axis=0)) * [1.0, 1.0, 0.0] + [0.0, 0.0, posed[:, 2].min()]
-    to_model = np.ptp(posed[:, 2]) / HEIGHT
+    middle, to_model = model.floor
     here = first.positions * to_model + middle
     facing = np.einsum("nij,nj->ni", blended[:, :3, :3], model.normals)
     towards = 0.05 * np.asarray(first.normals, np.float64)

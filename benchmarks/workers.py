@@ -1,13 +1,15 @@
-"""What workers make of a take: ``beam run`` of 24 cameras of 1080p by one process, and by one on each GPU.
+"""What workers make of a take: ``beam run`` of 24 cameras of 1080p by one process, several on a GPU, or one on each.
 
     python benchmarks/workers.py [--quick] [--parts PART] [--frames N --segment-length N] [--workers WORD ...] --out R
 
-``start``: how long a tiny take needs until its first step begins, and in all, kernels compiled before. ``take``:
+``start``: how long a tiny take needs until its first step begins, and in all, kernels compiled before. ``capture``: how
+long the capture walker takes in all, six frames of 24 views of 320 pixels, all options as they are. ``take``:
 The take shows a few moments of `beam_warp.demo.capture` over and over. A first run of few small views compiles kernels.
 For each way of working: the seconds of each kind of step; the time before the first one, from the first one to the end
-of the last, and after it; frames an hour of one worker, and the efficiency against the first way, both by the time from
-the first step to the last, for a take is long; the most memory that a process had; and whether the results are the same
-bytes. Cameras, masks and exposures are kept, for they are looked at once in a take.
+of the last, and after it; frames an hour of one GPU, and the efficiency of GPUs against the first way, both by the time
+from the first step to the last, for a take is long; the most memory that a process had; and whether the results are the
+same bytes. Cameras, masks and exposures are kept, for they are looked at once in a take; segments are cut, for they are
+so short here that seams would cost more than in a take (``--seam-frames``).
 """
 
 from __future__ import annotations
@@ -37,11 +39,14 @@ from beam_warp.demo.lights import studio
 from beam_warp.device.arrays import resolve_device
 from beam_warp.plan.crew import visible_gpus
 from beam_warp.plan.standing import look
+from beam_warp.plan.steps import Rank
 
 Row = dict[str, Any]
 
 BEAM = (sys.executable, "-P", "-c", "from beam_warp.cli.entry import beam; raise SystemExit(beam())")
-STARTS = 5
+STARTS, RUNS = 5, 2
+"""How often tiny takes, and a capture, are run."""
+
 KEPT = ("--cameras", "keep", "--masks", "keep", "--exposures", "keep", "--quiet")
 
 
@@ -58,6 +63,7 @@ class Bench:
         height: Of an image [pixel].
         gaussians: Of a frame.
         workers: What ``--workers`` is given, one run each.
+        seam: Frames in which segments overlap.
         more: Further words of the command.
     """
 
@@ -65,12 +71,14 @@ class Bench:
     segment: int
     drawn: int
     workers: tuple[str, ...]
+    seam: int = 0
     cameras: int = 24
     width: int = 1920
     height: int = 1080
     gaussians: int = 140_000
     more: tuple[str, ...] = ()
     place: Path = field(default_factory=Path)
+    data: Path = field(default_factory=Path)
 
     def capture(self, name: str, cameras: int, width: int, height: int, frames: int) -> Path:
         """Path trace a capture, and name its moments over and over."""
@@ -89,28 +97,33 @@ class Bench:
     def run(self, capture: Path, workers: str, gaussians: int) -> Row:
         """Run the command, and return what its receipts and its report say."""
         out = self.place / f"{capture.name} by {workers}"
-        size = ("--gaussians", str(gaussians), "--segment-length", str(self.segment))
+        size = ("--gaussians", str(gaussians), "--segment-length", str(self.segment), "--seam-frames", str(self.seam))
         command = [*BEAM, "run", str(capture), *size, "--workers", workers, "--out", str(out), *KEPT, *self.more]
         began = time.time()
         subprocess.run(command, check=True)
         ended = time.time()
-        receipts = look(out).receipts.values()
+        standing = look(out)
+        receipts = standing.receipts.values()
         first = min(receipt.ended - receipt.seconds for receipt in receipts)
         last = max(receipt.ended for receipt in receipts)
-        count = len(visible_gpus()) if workers == "gpus" else int(workers)
+        each, _, place = workers.rpartition("@")
+        count = int(each or 1) * len(visible_gpus()) if place == "gpus" else int(workers)
+        gpus = max(min(count, len(visible_gpus())), 1)
         times = dict[str, list[float]]()
-        for name, receipt in look(out).receipts.items():
-            times.setdefault(name.rpartition("-")[0] or name, []).append(receipt.seconds)
+        for step in standing.steps:
+            kind = "key frame" if step.rank == Rank.KEY_FRAME else step.stage
+            times.setdefault(kind, []).append(standing.receipts[step.name].seconds)
         report = json.loads((out / "report.json").read_text(encoding="utf-8"))
         return {
             "name": workers,
             "workers": count,
+            "gpus": gpus,
             "out": out,
             "before": first - began,
             "working": last - first,
             "after": ended - last,
             "busy": sum(receipt.seconds for receipt in receipts) / (count * (last - first)),
-            "frames_per_hour_a_worker": self.frames * 3600.0 / (last - first) / count,
+            "frames_per_hour_a_gpu": self.frames * 3600.0 / (last - first) / gpus,
             "steps": {stage: {"count": len(each), "median": statistics.median(each)} for stage, each in times.items()},
             "seconds": report["seconds"],
             "peak_bytes": 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss,
@@ -138,12 +151,12 @@ def take(bench: Bench) -> Iterator[Row]:
         row = bench.run(capture, workers, bench.gaussians)
         made = contents(row.pop("out"))
         if rows:
-            row["efficiency"] = rows[0]["working"] * rows[0]["workers"] / (row["working"] * row["workers"])
+            row["efficiency"] = rows[0]["working"] * rows[0]["gpus"] / (row["working"] * row["gpus"])
             row["differing_files"] = sorted(k for k in first.keys() | made.keys() if first.get(k) != made.get(k))
         first = first or made
         rows.append(row)
         say(json.dumps(row))
-        size = {"frames": bench.frames, "segment": bench.segment, "cameras": bench.cameras}
+        size = {"frames": bench.frames, "segment": bench.segment, "seam": bench.seam, "cameras": bench.cameras}
         yield {**size, "width": bench.width, "height": bench.height, "gaussians": bench.gaussians, "rows": rows}
 
 
@@ -163,24 +176,44 @@ def start(bench: Bench) -> Iterator[Row]:
         yield {"rows": rows}
 
 
-PARTS = {"start": start, "take": take}
+def capture(bench: Bench) -> Iterator[Row]:
+    """Run the command on a capture as it is, in each way, after a run that compiles."""
+    folder, rows = bench.data / "captures" / "walker", list[Row]()
+
+    def seconds(workers: str) -> float:
+        began = time.perf_counter()
+        out = bench.place / "walker"
+        subprocess.run([*BEAM, "run", str(folder), "--workers", workers, "--out", str(out), "--quiet"], check=True)
+        shutil.rmtree(out)
+        return time.perf_counter() - began
+
+    seconds(bench.workers[0])
+    for workers in bench.workers:
+        rows.append({"name": workers, "whole": spread(np.array([seconds(workers) for _ in range(RUNS)]))})
+        say(json.dumps(rows[-1]))
+        yield {"rows": rows}
+
+
+PARTS = {"start": start, "take": take, "capture": capture}
 
 
 def main() -> None:
     """Measure, and write the result after every run."""
-    parser = record.parser(__doc__, quick="small images, to see whether it runs", parts=PARTS)
+    parser = record.parser(__doc__, data=True, quick="small images, to see whether it runs", parts=PARTS)
     parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--segment-length", type=int, default=3)
+    parser.add_argument("--seam-frames", type=int, default=0)
     parser.add_argument("--drawn", type=int, default=2, help="moments that are path traced")
     parser.add_argument("--workers", nargs="+", default=["1", "gpus"], help="as beam run has it, one run each")
     arguments = parser.parse_args()
-    bench = Bench(arguments.frames, arguments.segment_length, arguments.drawn, tuple(arguments.workers))
+    sizes = arguments.frames, arguments.segment_length, arguments.drawn
+    bench = Bench(*sizes, tuple(arguments.workers), arguments.seam_frames)
     if arguments.quick:
-        bench = Bench(4, 2, 1, ("1", "2"), 8, 64, 48, 500, ("--device", "cpu", "--preset", "draft"))
+        bench = Bench(4, 2, 1, ("1", "2"), 0, 8, 64, 48, 500, ("--device", "cpu", "--preset", "draft"))
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     keep = functools.partial(record.write_result, arguments, resolve_device(None))
     with tempfile.TemporaryDirectory() as name:
-        bench.place = Path(name)
+        bench.place, bench.data = Path(name), arguments.data
         measure(PARTS, bench, only=arguments.parts, keep=keep)
 
 

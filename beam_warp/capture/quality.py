@@ -280,12 +280,13 @@ def photon_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
         Variance over value, in the units of the colour; NaN if hardly a square of pixels shows the subject alone, or
         all are dark.
     """
-    places = _some(np.argwhere(solid), MOST_SQUARES)
+    every = np.flatnonzero(solid)
+    places = np.stack(np.divmod(_some(every, MOST_SQUARES), solid.shape[1]), axis=1)
     whole = _windows(solid[..., None], places, SQUARE).all(axis=(1, 2, 3))
     squares = _windows(color, places[whole], SQUARE).astype(np.float64)
     level = squares.mean(axis=(1, 2))
     lit = level.min(axis=1) > DARK * np.median(level) if len(level) else np.zeros(0, bool)
-    if lit.sum() * np.count_nonzero(solid) < FEWEST_PIXELS * max(len(places), 1):
+    if lit.sum() * len(every) < FEWEST_PIXELS * max(len(places), 1):
         return np.nan
     scaled = squares[lit] / np.sqrt(level[lit, None, None])
     differences = convolve(scaled, SECOND_DIFFERENCE[None, ..., None])[:, 1:-1, 1:-1].reshape(lit.sum(), -1, 3)

@@ -149,8 +149,7 @@ class CaptureRecord:
         elif mask is not None:
             image = _masked(image, mask)
         image = self._undistorted(image)
-        rgba = image.linear_rgba()
-        alpha = None if image.alpha is None else rgba[..., 3]
+        color, alpha = image.linear_rgb(), image.alpha
         if alpha is not None:
             if not _is_coverage(alpha):
                 raise AssetFormatError(
@@ -158,12 +157,11 @@ class CaptureRecord:
                     f"{' and NaN' if np.isnan(alpha).any() else ''} at {self.image_path}. Export the image again."
                 )
             alpha = np.clip(alpha, 0.0, 1.0)
-        if not np.isfinite(rgba).all():
+        if not np.isfinite(color).all():
             raise AssetFormatError(
-                f"image must be finite, got NaN or infinity in {int((~np.isfinite(rgba)).any(axis=-1).sum())} pixels "
+                f"image must be finite, got NaN or infinity in {int((~np.isfinite(color)).any(axis=-1).sum())} pixels "
                 f"at {self.image_path}. Export it again, or repair those pixels."
             )
-        color = rgba[..., :3]
         if self.gains != (1.0, 1.0, 1.0):
             color = color / np.array(self.gains, np.float32)
         doubt = image.channels.get(DOUBT)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.capture.mattes import MaskOffset
 from beam_warp.checks import require_array, require_count, require_finite, require_range
 from beam_warp.errors import InvalidArrayError
+from beam_warp.image.metrics import block_means
 from beam_warp.world.camera import Camera
 
 
@@ -49,6 +51,21 @@ class CapturedView:
                 require_range(name, part, 0.0, 1.0)
                 object.__setattr__(self, name, part)
 
+    @cached_property
+    def subject(self) -> tuple[tuple[int, int], tuple[int, int]] | None:
+        """First column and row of the subject, and the ones after its last; zeros for none, None where alpha is."""
+        if self.alpha is None:
+            return None
+        rows, columns = (np.flatnonzero((self.alpha > 0.0).any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return (0, 0), (0, 0)
+        return (int(columns[0]), int(rows[0])), (int(columns[-1]) + 1, int(rows[-1]) + 1)
+
+    @cached_property
+    def covered(self) -> float:
+        """How many pixels the subject covers; all of the image where that is not known."""
+        return float(self.camera.width * self.camera.height if self.alpha is None else self.alpha.sum())
+
     def cropped(self, left: int, top: int, width: int, height: int) -> CapturedView:
         """Return a part of the view with its camera.
 
@@ -60,6 +77,8 @@ class CapturedView:
                 f"crop must lie in {self.camera.width} x {self.camera.height} pixels, got {width} x {height} at "
                 f"{left}, {top}. Cut it down."
             )
+        if (width, height) == (self.camera.width, self.camera.height):
+            return self
         part = (slice(top, top + height), slice(left, left + width))
         return replace(
             self,
@@ -84,11 +103,11 @@ class CapturedView:
                 f"factor must leave a pixel of {self.camera.width} x {self.camera.height}, got {factor}. "
                 "Choose a smaller one."
             )
+        if factor == 1:
+            return self
 
         def mean(image: ArrayLike) -> NDArray[np.float32]:
-            whole = np.asarray(image)[: height * factor, : width * factor]
-            blocks = whole.reshape(height, factor, width, factor, *whole.shape[2:])
-            return blocks.mean(axis=(1, 3), dtype=np.float32)
+            return block_means(np.asarray(image, np.float32)[: height * factor, : width * factor], factor)
 
         return replace(
             self,

@@ -143,11 +143,15 @@ def _lines(scores: MaterialScores) -> list[str]:
     if depth is not None:
         lines.append(f"depth: median error {depth:.2f} mm")
     temporal = scores.temporal
-    if temporal.gaussians is not None:
-        lines.append(f"base colour over time, per Gaussian: {_deviation(temporal.gaussians)}")
-    if temporal.surface is not None:
-        surface = temporal.surface
-        lines.append(f"base colour over time, at points of the surface: {_deviation(surface.ours)}")
+    for channel, gaussians, surface in (
+        ("base colour", temporal.gaussians, temporal.surface),
+        ("ambient occlusion", temporal.occlusion_gaussians, temporal.occlusion_surface),
+    ):
+        if gaussians is not None:
+            lines.append(f"{channel} over time, per Gaussian: {_deviation(gaussians)}")
+        if surface is None:
+            continue
+        lines.append(f"{channel} over time, at points of the surface: {_deviation(surface.ours)}")
         if surface.ours_where_known is not None and surface.truth is not None:
             lines.append(
                 f"  where the truth is drawn too: {_deviation(surface.ours_where_known)}; "

@@ -260,13 +260,25 @@ class MaterialWork:
         return str(index) if self.frames.step(number) else self.source.digest(self._frame(index))
 
     def _frame(self, index: int) -> SeenFrame:
-        """Return a frame; the latest one is not read again."""
+        """Return a frame; the latest ones are not read again."""
         if index == 0:
             return self.source.first
-        latest: SeenFrame | None = vars(self).get("_latest")
-        if latest is None or latest.number != index:
-            latest = vars(self)["_latest"] = self.source.frame(index)
-        return latest
+        if index not in self._latest:
+            if len(self._latest) >= self._most_kept:
+                self._latest.clear()
+            self._latest[index] = self.source.frame(index)
+        return self._latest[index]
+
+    @cached_property
+    def _latest(self) -> dict[int, SeenFrame]:
+        return {}
+
+    @cached_property
+    def _most_kept(self) -> int:
+        """How many frames are kept with what their views show: all, if roughness is found from all; else the latest."""
+        asked = asked_frames(len(self.frames.numbers()))
+        is_asked = self.options.roughness == ESTIMATE and self._may_be_persistent
+        return len(asked) if is_asked and len(asked) == len(self.frames.numbers()) else 1
 
     def _place(self, step: Step) -> int:
         assert step.frame is not None
@@ -327,6 +339,7 @@ class MaterialWork:
         with self.source.log.timer("store"):
             self.archive.keep(measured)
         frame.forget()
+        self._latest.pop(index, None)
         if self.solves:
             facts["counts"] = [solve_frame(self.job, measured)]
         elif not self._solves_later:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.image.files import Image
 from beam_warp.image.metrics import block_means
 from beam_warp.raster.channels import RADIANCE, UNIT_CHANNELS
 from beam_warp.raster.gbuffer import rasterize
@@ -93,3 +94,14 @@ def draw_materials(
         {name: mean(buffer.channels[name], name in UNIT_CHANNELS) for name in channels},
         block_means(seen_radiance(buffer, cloud), samples).astype(np.float32) if radiance else None,
     )
+
+
+def true_channel(truth: Image, name: str) -> NDArray[np.float32] | None:
+    """Return an exact channel by the name of a cloud's array, or ``depth``; None where the file lacks it."""
+    layers = {
+        "base_color": ("base_color.R", "base_color.G", "base_color.B"),
+        "normals": ("normal.X", "normal.Y", "normal.Z"),
+    }.get(name, (name,))
+    if any(layer not in truth.channels for layer in layers):
+        return None
+    return truth.stack(*layers) if len(layers) > 1 else truth.channels[name]

@@ -3,7 +3,7 @@
 read      `beam_warp.evaluate.compared`     frames, records with truth, lights
 draw      `beam_warp.evaluate.views`        channels and relit images of every view, and their scores
 scale     here                              base colour once more, times the factor that fits it best
-follow    `beam_warp.evaluate.steadiness`   base colour over time
+follow    `beam_warp.evaluate.steadiness`   base colour and occlusion over time
 """
 
 from __future__ import annotations
@@ -210,9 +210,8 @@ def _with_scale(
 
 
 def _temporal(asset: ComparedAsset, scorer: ViewScorer, progress: StageProgress) -> TemporalScores:
-    """Measure how steady base colour is."""
+    """Measure how steady base colour and ambient occlusion are."""
     numbers = [number for number, _ in sorted(asset.matched.items(), key=lambda pair: pair[1])]
-    gaussians = gaussian_deviation(asset.sequence, numbers)
     surface = surface_scores(
         asset,
         raster=scorer.raster,
@@ -220,10 +219,14 @@ def _temporal(asset: ComparedAsset, scorer: ViewScorer, progress: StageProgress)
         device=scorer.device,
         progress=lambda done, total: progress("score over time", done, total),
     )
-    absent = {name: found for name, found in (("gaussians", gaussians), ("surface", surface)) if isinstance(found, str)}
-    return TemporalScores(
-        None if isinstance(gaussians, str) else gaussians, None if isinstance(surface, str) else surface, absent
-    )
+    found = {
+        "gaussians": gaussian_deviation(asset.sequence, numbers),
+        "surface": surface["base_color"],
+        "occlusion_gaussians": gaussian_deviation(asset.sequence, numbers, "ambient_occlusion"),
+        "occlusion_surface": surface["ambient_occlusion"],
+    }
+    absent = {name: entry for name, entry in found.items() if isinstance(entry, str)}
+    return TemporalScores(**{name: None if name in absent else entry for name, entry in found.items()}, absent=absent)
 
 
 def _absent(

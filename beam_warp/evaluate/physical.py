@@ -159,9 +159,9 @@ def steadiness(sequence: GaussianSequence) -> Measured:
     frames = np.unique(np.linspace(0, len(sequence) - 1, MOST_FRAMES).round().astype(int))
     stated, columns = np.concatenate([each for each in errors if each is not None], axis=1), 3 + (errors[1] is not None)
     running = [RunningVariance(len(first), 1) for _ in range(columns)]
-    for cloud in (sequence[int(frame)] for frame in frames):
-        for column, values in zip(running, _materials(cloud), strict=False):
-            column.add(values[:, None])
+    for frame in frames.tolist():
+        for column, values in zip(running, _materials(sequence[frame]), strict=False):
+            column.add(frame, values[:, None])
     variance = np.stack([np.square(column.deviations()) for column in running], axis=1)
     solid = first.opacities >= LEAST_OPACITY
     return rules.steady(variance[solid] * len(frames) / (len(frames) - 1), stated[solid])

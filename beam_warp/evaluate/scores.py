@@ -111,7 +111,7 @@ class MaterialScores:
         base_color_scale: Factor per channel that best carries base colour to the truth, by least squares over the
             solid pixels of all views and frames; None without truth.
         frame_scales: The same for every frame by itself; a frame whose true base colour is not known has none.
-        temporal: How steady base colour is.
+        temporal: How steady base colour and ambient occlusion are.
         conditions: How it was measured, JSON-able.
         absent: What could not be measured, by name, and why.
         notes: What a reader should know, each a sentence.

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.evaluate.drawn import true_channel
 from beam_warp.evaluate.scores import ImageScore
-from beam_warp.evaluate.views import ScoredView, true_channel
+from beam_warp.evaluate.views import ScoredView
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.metrics import bounding_box
 from beam_warp.image.panels import BACKGROUND, Panel, lay_out

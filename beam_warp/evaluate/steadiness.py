@@ -1,10 +1,13 @@
-"""Steadiness of base colour over time: per Gaussian, and at points that are fixed on the true surface."""
+"""Steadiness of base colour and ambient occlusion over time: per Gaussian, and at points fixed on the true surface.
+
+Such a point is what a texel of a texture is, so that the latter is flicker in texture space too, whatever the layout.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.checks import require_count
 from beam_warp.evaluate.compared import ComparedAsset
-from beam_warp.evaluate.drawn import SAMPLES, draw_materials
+from beam_warp.evaluate.drawn import SAMPLES, DrawnMaterials, draw_materials, true_channel
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.jobs.listeners import CountProgress
 from beam_warp.mesh.distances import SurfaceTree
@@ -39,7 +42,10 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Deviation:
-    """Standard deviations over time of display-encoded base colour (0 to 1), root mean square over channels.
+    """Standard deviations over time of a channel from 0 to 1, root mean square over its components.
+
+    Base colour is encoded for display, and does not change: its deviation is from the mean over all frames. Occlusion
+    changes as the subject moves: its deviation is the noise that second differences show (`RunningFlicker`).
 
     Attributes:
         mean: Mean over Gaussians or points.
@@ -64,12 +70,12 @@ class Deviation:
 
 @dataclass(frozen=True)
 class SurfaceScores:
-    """Steadiness of the base colour of points that are fixed on the true surface, as test cameras see them.
+    """Steadiness of a channel at points that are fixed on the true surface, as test cameras see them.
 
     Attributes:
         ours: Over all frames whose true surface is known.
-        ours_where_known: Over the frames whose true images are known as well; None if they are fewer than two.
-        truth: The same of the true images: what drawing points as pixels costs, for the surface itself does not change.
+        ours_where_known: Over the frames whose true images are known as well; None if they are too few.
+        truth: The same of the true images: what drawing points as pixels costs, and, of occlusion, uneven change.
         error: Root mean square difference of ours to the true images at those points; None without true images.
     """
 
@@ -81,16 +87,20 @@ class SurfaceScores:
 
 @dataclass(frozen=True)
 class TemporalScores:
-    """Steadiness of base colour over time.
+    """Steadiness over time.
 
     Attributes:
-        gaussians: Of Gaussians that persist, all frames of the asset.
-        surface: Of points of the true surface.
+        gaussians: Of Gaussians that persist, base colour, all frames of the asset.
+        surface: Of points of the true surface, base colour.
+        occlusion_gaussians: Of Gaussians, ambient occlusion.
+        occlusion_surface: Of points of the true surface, ambient occlusion.
         absent: By name of an attribute, why there is none.
     """
 
     gaussians: Deviation | None
     surface: SurfaceScores | None
+    occlusion_gaussians: Deviation | None
+    occlusion_surface: SurfaceScores | None
     absent: Mapping[str, str]
 
     def as_dict(self) -> dict[str, Any]:
@@ -107,8 +117,8 @@ class RunningVariance:
         self._means = np.zeros((rows, columns))
         self._squares = np.zeros((rows, columns))
 
-    def add(self, values: NDArray[np.floating[Any]], seen: NDArray[np.bool_] | None = None) -> None:
-        """Take the values of a frame, ``(rows, columns)``, where they are seen."""
+    def add(self, frame: int, values: NDArray[np.floating[Any]], seen: NDArray[np.bool_] | None = None) -> None:
+        """Take the values of a frame, ``(rows, columns)``, where they are seen; its number does not matter."""
         rows = np.arange(len(self.counts)) if seen is None else np.flatnonzero(seen)
         self.counts[rows] += 1
         away = values[rows] - self._means[rows]
@@ -124,26 +134,75 @@ class RunningVariance:
         return np.where(self.counts >= 2, np.sqrt(variances), np.nan)
 
 
-def gaussian_deviation(sequence: GaussianSequence, frames: Sequence[int]) -> Deviation | str:
-    """Return the deviations of Gaussians' base colour over all frames of an asset, or why there are none.
+class RunningFlicker:
+    """Noise of rows that come one frame at a time and change evenly; a row may be missing in a frame.
+
+    Three frames that are as far from each other have the second difference d = x_1 - 2 x_2 + x_3: 0 where x changes at
+    an even rate, and of the variance 6 σ² where x has independent noise of the deviation σ.
+    """
+
+    def __init__(self, rows: int, columns: int) -> None:
+        """Start with nothing."""
+        self._counts = np.zeros(rows, np.int64)
+        self._squares = np.zeros(rows)
+        self._columns = columns
+        self._before: list[tuple[int, FloatArray, NDArray[np.bool_]]] = []
+
+    def add(self, frame: int, values: NDArray[np.floating[Any]], seen: NDArray[np.bool_] | None = None) -> None:
+        """Take the values of a frame of this number, ``(rows, columns)``, where they are seen; numbers rise."""
+        there = np.ones(len(self._counts), bool) if seen is None else seen
+        self._before = [*self._before, (frame, np.array(values, np.float64), np.array(there))][-3:]
+        if len(self._before) < 3:
+            return
+        (first, one, a), (middle, two, b), (_, three, c) = self._before
+        if frame - middle == middle - first:
+            rows = np.flatnonzero(a & b & c)
+            self._counts[rows] += 1
+            self._squares[rows] += ((one - 2.0 * two + three)[rows] ** 2).mean(axis=1)
+
+    def deviations(self) -> FloatArray:
+        """Return the standard deviation of the noise, root mean square over columns, ``(rows,)``; NaN if not known."""
+        return np.where(self._counts > 0, np.sqrt(self._squares / np.maximum(6 * self._counts, 1)), np.nan)
+
+
+Running = RunningVariance | RunningFlicker
+
+RUNNING: Mapping[str, type[RunningVariance] | type[RunningFlicker]] = MappingProxyType(
+    {"base_color": RunningVariance, "ambient_occlusion": RunningFlicker}
+)
+"""What is followed over time, and what of it counts."""
+
+
+def gaussian_deviation(
+    sequence: GaussianSequence, frames: Sequence[int], channel: str = "base_color"
+) -> Deviation | str:
+    """Return the deviations of Gaussians over all frames of an asset, or why there are none.
 
     Args:
-        sequence: With base colour; every Gaussian counts alike.
+        sequence: Relightable; every Gaussian counts alike.
         frames: The capture's number of every frame.
+        channel: Which one of `RUNNING`.
     """
     if len(sequence) < 2:
         return "the asset has one frame"
     if sequence.topology != "constant":
         return "Gaussians do not persist from frame to frame"
-    if "base_color" in sequence.constant:
+    if channel in sequence.constant:
         return Deviation(0.0, 0.0, len(sequence[0]), tuple(frames))
-    running: RunningVariance | None = None
-    for cloud in sequence:
-        colors = linear_to_srgb(np.asarray(cloud.base_color, np.float64))
-        running = running or RunningVariance(*colors.shape)
-        running.add(colors)
+    running: Running | None = None
+    for frame, cloud in zip(frames, sequence, strict=True):
+        values = encoded(channel, np.asarray(getattr(cloud, channel), np.float64).reshape(len(cloud), -1))
+        running = running or RUNNING[channel](*values.shape)
+        running.add(frame, values)
+    if running is not None and not np.isfinite(running.deviations()).any():
+        return "no three frames of the asset are evenly apart"
     found = None if running is None else Deviation.of(running.deviations(), frames)
     return found or "the asset has no Gaussians"
+
+
+def encoded(channel: str, values: FloatArray) -> FloatArray:
+    """Return values of a channel as they are compared: base colour encoded for display."""
+    return linear_to_srgb(np.clip(values, 0.0, 1.0)) if channel == "base_color" else values
 
 
 def surface_scores(
@@ -154,14 +213,14 @@ def surface_scores(
     point_count: int = POINT_COUNT,
     device: str | None = None,
     progress: CountProgress | None = None,
-) -> SurfaceScores | str:
-    """Follow points of the true surface through the test views, or say why that cannot be.
+) -> dict[str, SurfaceScores | str]:
+    """Follow points of the true surface through the test views: by channel of `RUNNING` its scores, or why it has none.
 
     Points are uniform by area on the surface of the first frame, and stay on their triangles. In every frame and view
     a point counts that the camera sees past every triangle, from the front by a cosine of at least `LEAST_COSINE`, and
-    whose four nearest pixels lie on the same piece of surface: there base colour is interpolated between those
-    pixels. Its standard deviation over frames is taken for each view by itself, so that nothing but time changes, and
-    averaged over the views in which the point is seen in at least two frames.
+    whose four nearest pixels lie on the same piece of surface: there channels are interpolated between those pixels.
+    Their deviation over frames is taken for each view by itself, so that nothing but time changes, and averaged over
+    the views in which the point is seen in enough frames: two for base colour, three evenly apart for occlusion.
 
     Args:
         asset: Relightable. The capture's ``truth/mesh_FFFF.npz`` are of one topology; triangles that are cut otherwise
@@ -180,10 +239,10 @@ def surface_scores(
     capture = asset.capture
     frames = [frame for frame in sorted(asset.matched) if (capture.folder / f"truth/mesh_{frame:04d}.npz").is_file()]
     if len(frames) < 2:
-        return "fewer than two frames of the asset have a true surface"
+        return dict.fromkeys(RUNNING, "fewer than two frames of the asset have a true surface")
     lasting = _lasting_faces(capture, frames)
     if not lasting.mean() >= LEAST_LASTING:
-        return "the true surface is not of one topology in all frames"
+        return dict.fromkeys(RUNNING, "the true surface is not of one topology in all frames")
     followed: _Followed | None = None
     for done, frame in enumerate(frames, start=1):
         mesh = read_truth_mesh(capture, frame)
@@ -195,13 +254,17 @@ def surface_scores(
         cloud = asset.cloud(frame)
         for name, camera, record in _views(capture, asset.split, frame):
             drawn = draw_materials(
-                cloud, camera, channels=("base_color",), raster=raster, samples=samples, device=device
+                cloud, camera, channels=tuple(RUNNING), raster=raster, samples=samples, device=device
             )
-            followed.add(name, camera, drawn.channels["base_color"], drawn.alpha, record)
+            followed.add(frame, name, camera, drawn, record)
         if progress is not None:
             progress(done, len(frames))
-    found = None if followed is None else followed.scores(frames)
-    return found or "no point of the true surface is seen in two frames by a camera"
+    assert followed is not None
+    too_few = {"base_color": "two frames", "ambient_occlusion": "three frames that are evenly apart"}
+    return {
+        channel: followed.scores(channel, frames) or f"no point of the true surface is seen in {few} by a camera"
+        for channel, few in too_few.items()
+    }
 
 
 def _lasting_faces(capture: Capture, frames: Sequence[int]) -> NDArray[np.bool_]:
@@ -241,37 +304,56 @@ class _Followed:
     def __init__(self, tree: SurfaceTree, faces: NDArray[np.int32], weights: FloatArray) -> None:
         self.tree = tree
         self._faces, self._weights = faces, weights
-        self._ours, self._where_known, self._truth = (
-            defaultdict[str, RunningVariance](lambda: RunningVariance(len(faces), 3)) for _ in range(3)
-        )
+        self._seen = {channel: _Seen(channel) for channel in RUNNING}
+
+    def add(self, frame: int, view: str, camera: Camera, drawn: DrawnMaterials, record: CaptureRecord | None) -> None:
+        """Take what a view shows of the points."""
+        places, seen = readable_points(self.tree, camera, self._faces, self._weights)
+        truth = None if record is None or record.truth_path is None else record.truth()
+        for channel, kept in self._seen.items():
+            ours = interpolated(drawn.channels[channel], drawn.alpha, places[:, :2], seen)
+            known = None if truth is None else true_channel(truth, channel)
+            theirs = None
+            if truth is not None and known is not None:
+                theirs = interpolated(known, truth.channels["A"], places[:, :2], seen)
+            kept.add(frame, view, ours, theirs, seen)
+
+    def scores(self, channel: str, frames: Sequence[int]) -> SurfaceScores | None:
+        """Summarise all frames."""
+        return self._seen[channel].scores(frames)
+
+
+class _Seen:
+    """What was seen of a channel at the points, view by view."""
+
+    def __init__(self, channel: str) -> None:
+        self._channel = channel
+        self._ours, self._where_known, self._truth = (dict[str, Running]() for _ in range(3))
         self._known_frames: set[int] = set()
         self._squares, self._compared = 0.0, 0
 
-    def add(
-        self,
-        view: str,
-        camera: Camera,
-        colors: NDArray[np.float32],
-        alpha: NDArray[np.float32],
-        record: CaptureRecord | None,
-    ) -> None:
-        """Take what a view shows of the points."""
-        places, seen = readable_points(self.tree, camera, self._faces, self._weights)
-        ours = linear_to_srgb(np.clip(interpolated(colors, alpha, places[:, :2], seen), 0.0, 1.0))
-        self._ours[view].add(ours, seen)
-        truth = None if record is None or record.truth_path is None else record.truth()
-        if truth is None or record is None or "base_color.R" not in truth.channels:
+    def add(self, frame: int, view: str, ours: FloatArray, truth: FloatArray | None, seen: NDArray[np.bool_]) -> None:
+        """Take the values of a view, ``(N, C)``, and the true ones, if they are known."""
+        ours = encoded(self._channel, ours)
+        self._take(self._ours, frame, view, ours, seen)
+        if truth is None:
             return
-        known = truth.stack("base_color.R", "base_color.G", "base_color.B")
-        theirs = linear_to_srgb(np.clip(interpolated(known, truth.channels["A"], places[:, :2], seen), 0.0, 1.0))
-        self._where_known[view].add(ours, seen)
-        self._truth[view].add(theirs, seen)
-        self._known_frames.add(record.frame)
-        self._squares += float(((ours - theirs)[seen] ** 2).sum())
-        self._compared += 3 * int(np.count_nonzero(seen))
+        truth = encoded(self._channel, truth)
+        self._take(self._where_known, frame, view, ours, seen)
+        self._take(self._truth, frame, view, truth, seen)
+        self._known_frames.add(frame)
+        self._squares += float(((ours - truth)[seen] ** 2).sum())
+        self._compared += ours.shape[1] * int(np.count_nonzero(seen))
+
+    def _take(
+        self, running: dict[str, Running], frame: int, view: str, values: FloatArray, seen: NDArray[np.bool_]
+    ) -> None:
+        if view not in running:
+            running[view] = RUNNING[self._channel](*values.shape)
+        running[view].add(frame, values, seen)
 
     def scores(self, frames: Sequence[int]) -> SurfaceScores | None:
-        """Summarise all frames."""
+        """Summarise all frames; None if there is no deviation."""
         known = sorted(self._known_frames)
         ours = Deviation.of(_mean_over_views(self._ours), frames)
         if ours is None:
@@ -320,7 +402,7 @@ def readable_points(
 def interpolated(
     image: NDArray[np.floating[Any]], alpha: NDArray[np.floating[Any]], places: FloatArray, seen: NDArray[np.bool_]
 ) -> FloatArray:
-    """Return an image ``(H, W, C)``, not multiplied by alpha, between pixel centres, weighted by alpha.
+    """Return an image ``(H, W, C)`` or ``(H, W)``, not multiplied by alpha, between pixel centres, weighted by alpha.
 
     Args:
         image: What is read.
@@ -329,8 +411,9 @@ def interpolated(
         seen: Which places are read, all of them between four pixels.
 
     Returns:
-        ``(N, C)``; 0 for what is not read.
+        ``(N, C)``, C of an image without channels being 1; 0 for what is not read.
     """
+    image = image.reshape(*image.shape[:2], -1)
     result = np.zeros((len(places), image.shape[-1]))
     x, y = (places[seen] - 0.5).T
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
@@ -345,7 +428,7 @@ def interpolated(
     return result
 
 
-def _mean_over_views(running: Mapping[str, RunningVariance]) -> FloatArray:
+def _mean_over_views(running: Mapping[str, Running]) -> FloatArray:
     """Return the mean over views of every point's deviation; NaN where no view has one."""
     if not running:
         return np.zeros(0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.capture import CaptureRecord
-from beam_warp.evaluate.drawn import DrawnMaterials, draw_materials
+from beam_warp.evaluate.drawn import DrawnMaterials, draw_materials, true_channel
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.scores import ImageScore, MaterialViewScores, Scales, as_triple
 from beam_warp.image.files import Image
@@ -196,17 +196,6 @@ class ViewScorer:
             "region": "bounding box of the truth's alpha above 0.5; solid: alpha above 0.999",
             "color_encoding": "sRGB, cut to [0, 1]",
         }
-
-
-def true_channel(truth: Image, name: str) -> NDArray[np.float32] | None:
-    """Return an exact channel by the name of a cloud's array, or ``depth``; None where the file lacks it."""
-    layers = {
-        "base_color": ("base_color.R", "base_color.G", "base_color.B"),
-        "normals": ("normal.X", "normal.Y", "normal.Z"),
-    }.get(name, (name,))
-    if any(layer not in truth.channels for layer in layers):
-        return None
-    return truth.stack(*layers) if len(layers) > 1 else truth.channels[name]
 
 
 def overlap(one: NDArray[np.float32], two: NDArray[np.float32]) -> float:

@@ -118,15 +118,20 @@ class Image:
 
     def linear_rgba(self) -> NDArray[np.float32]:
         """Return scene-linear Rec.709 with alpha premultiplied, ``(H, W, 4)``; alpha is 1 where the file has none."""
-        rgb = self.rgb()
+        rgb = self.linear_rgb()
         alpha = np.ones(rgb.shape[:2], np.float32) if self.alpha is None else self.alpha
-        weight = np.float32(1.0) if self.premultiplied else alpha[..., None]
+        return np.concatenate([rgb, alpha[..., None]], axis=-1)
+
+    def linear_rgb(self) -> NDArray[np.float32]:
+        """Return the colour of `linear_rgba`, ``(H, W, 3)``."""
+        rgb, weight = self.rgb(), None if self.alpha is None else self.alpha[..., None]
         if self.color_space == DISPLAY_SRGB:
-            if self.premultiplied and self.alpha is not None:  # the curve applies to the colour, not to its product
-                rgb = np.divide(rgb, alpha[..., None], out=np.zeros_like(rgb), where=alpha[..., None] > 0)
-                weight = alpha[..., None]
+            if self.premultiplied and weight is not None:  # the curve applies to the colour, not to its product
+                rgb = np.divide(rgb, weight, out=np.zeros_like(rgb), where=weight > 0)
             rgb = srgb_to_linear(rgb)
-        return np.concatenate([rgb * weight, alpha[..., None]], axis=-1)
+        elif self.premultiplied:
+            return rgb
+        return rgb if weight is None else rgb * weight
 
 
 SCENE_REFERRED_SUFFIXES = (".exr", ".hdr")
@@ -409,4 +414,5 @@ def write_png(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> None:
             "Encode linear values with display_image."
         )
     with replacing(path) as temporary:
-        PillowImage.fromarray(np.ascontiguousarray(array)).save(temporary, format="PNG")
+        # Higher levels take far longer, and save little of what renders are.
+        PillowImage.fromarray(np.ascontiguousarray(array)).save(temporary, format="PNG", compress_level=3)

@@ -175,7 +175,7 @@ def largest_value(views: Sequence[CapturedView], color_space: str | None) -> flo
     """
     if color_space == DISPLAY_SRGB:
         return 1.0
-    shown = [view.color.max(axis=-1)[_subject(view)] for view in views]
+    shown = [_largest_channel(view)[_subject(view)] for view in views]
     shown = [values for values in shown if len(values)]
     largest = max((float(values.max()) for values in shown), default=0.0)
     cut = sum(float((values == largest).mean()) >= CUT_PART for values in shown)
@@ -193,7 +193,7 @@ def judge_clipping(views: Sequence[CapturedView], ceiling: float) -> list[Findin
     for view in views:
         subject = _subject(view)
         if subject.any() and np.isfinite(ceiling):
-            parts[view.name] = float((view.color.max(axis=-1)[subject] >= ceiling * (1.0 - SAME)).mean())
+            parts[view.name] = float((_largest_channel(view)[subject] >= ceiling * (1.0 - SAME)).mean())
     cut = {name: part for name, part in parts.items() if part >= CUT_PART}
     if not cut:
         return []
@@ -209,6 +209,12 @@ def judge_clipping(views: Sequence[CapturedView], ceiling: float) -> list[Findin
             "images lower, or give scene-linear ones.",
         )
     ]
+
+
+def _largest_channel(view: CapturedView) -> NDArray[np.float32]:
+    """Return the largest channel of every pixel, ``(H, W)``; NumPy's own search along so short an axis is slow."""
+    red, green, blue = np.moveaxis(view.color, -1, 0)
+    return np.maximum(np.maximum(red, green), blue)
 
 
 def _subject(view: CapturedView) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -97,6 +98,13 @@ class ViewEvidence:
     colors: wp.array
     directions: wp.array
     misfit: NDArray[np.float32]
+
+
+class Shown(NamedTuple):
+    """What an image shows of the subject, and the variance of its pixels over their values."""
+
+    image: CapturedView
+    noise: float
 
 
 def view_evidence(
@@ -197,12 +205,12 @@ def view_evidence(
 
 
 def _groups(
-    count: int, views: Iterator[tuple[Camera, CapturedView | None]], options: RasterOptions | None, device: wp.Device
-) -> Iterator[tuple[Rasterizer, range, list[CapturedView | None]]]:
+    count: int, views: Iterator[tuple[Camera, Shown | None]], options: RasterOptions | None, device: wp.Device
+) -> Iterator[tuple[Rasterizer, range, list[Shown | None]]]:
     """Rasterise some views at a time; views of the same sizes share their buffers."""
     rasterizer: Rasterizer | None = None
     start = 0
-    group: list[tuple[Camera, CapturedView | None]] = []
+    group: list[tuple[Camera, Shown | None]] = []
     for view in itertools.chain(views, (None,)):
         pixels = sum(camera.width * camera.height for camera, _ in group)
         if group and (view is None or pixels + view[0].width * view[0].height > PIXELS_AT_ONCE):
@@ -221,25 +229,25 @@ def _groups(
 
 def _cut_to_subject(
     cloud: GaussianCloud, cameras: Sequence[Camera], images: Sequence[CapturedView] | None
-) -> Iterator[tuple[Camera, CapturedView | None]]:
+) -> Iterator[tuple[Camera, Shown | None]]:
     """Cut cameras and images to where Gaussians can be: most of a picture is background, which costs as much to move.
 
-    Images are cut ahead by threads while earlier ones are worked on.
+    Images are cut, and their noise is measured, ahead by threads while earlier ones are worked on.
     """
     low, high = _bounds(cloud)
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
 
-    def cut(index: int) -> tuple[Camera, CapturedView | None]:
+    def cut(index: int) -> tuple[Camera, Shown | None]:
         camera, image = cameras[index], None if images is None else images[index]
         left, top, right, bottom = _box(camera, corners)
         part = (left, top, right - left, bottom - top)
         if image is not None:
             image = image.cropped(*part)
-            return image.camera, image
+            return image.camera, Shown(image, _noise(image))
         return camera.cropped(*part), None
 
     with ThreadPoolExecutor(CUTTING_THREADS) as pool:
-        waiting: deque[Future[tuple[Camera, CapturedView | None]]] = deque()
+        waiting: deque[Future[tuple[Camera, Shown | None]]] = deque()
         for index in range(len(cameras)):
             waiting.append(pool.submit(cut, index))
             if len(waiting) > CUTTING_THREADS:
@@ -292,13 +300,13 @@ def _noise(image: CapturedView) -> float:
     return float(np.nan_to_num(photon_noise(image.color, solid)))
 
 
-def _captured(image: CapturedView | None, ceiling: float, device: wp.Device) -> CapturedPixels:
+def _captured(shown: Shown | None, ceiling: float, device: wp.Device) -> CapturedPixels:
     """Bring an image to the device."""
-    captured = CapturedPixels()
+    captured, image = CapturedPixels(), None if shown is None else shown.image
     color = np.zeros((0, 3), np.float32) if image is None else image.color.reshape(-1, 3)
     coverage = np.zeros(0, np.float32) if image is None or image.alpha is None else image.alpha.reshape(-1)
     captured.color = upload(color, wp.vec3, device)
     captured.coverage = upload(coverage, float, device)
     captured.ceiling = HEADROOM * ceiling
-    captured.noise = 0.0 if image is None else _noise(image)
+    captured.noise = 0.0 if shown is None else shown.noise
     return captured

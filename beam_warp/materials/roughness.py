@@ -21,6 +21,7 @@ Bissiri, Holmes and Walker 2016 (evidence from a misfit, exp(-T A), and the choi
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from beam_warp.checks import require_number
@@ -345,17 +347,14 @@ def _weigh(
 def _worth(log_prior: NDArray[np.float64], parts: NDArray[np.float64], counted: float) -> _Evidence:
     """Return the precision at which halves of the views tell most of each other; 0 if they do not."""
     _, even, odd = parts
-    agreement = [
-        counted
-        * float(
-            (
-                _log_evidence(log_prior, even + odd, precision)
-                - _log_evidence(log_prior, even, precision)
-                - _log_evidence(log_prior, odd, precision)
-            ).sum()
-        )
-        for precision in PRECISIONS
-    ]
+    both = even + odd
+
+    def agree(precision: float) -> float:
+        together, *halves = (_log_evidence(log_prior, misfit, precision) for misfit in (both, even, odd))
+        return counted * float((together - halves[0] - halves[1]).sum())
+
+    with ThreadPoolExecutor() as pool:
+        agreement = list(pool.map(agree, PRECISIONS))
     best = int(np.argmax(agreement))
     if not agreement[best] > LEAST_AGREEMENT:
         return _Evidence(0.0, agreement[best])
@@ -425,11 +424,10 @@ def _cluster_sums(misfit: NDArray[np.float64], cluster: NDArray[np.integer[Any]]
 def _sums_around(tree: cKDTree, clusters: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Add up the misfits of every cluster and its nearest ones, ``count`` in all."""
     count = min(count, tree.n)
-    near = tree.query(tree.data, k=count, workers=-1)[1].reshape(tree.n, count)
-    total = np.zeros_like(clusters)
-    for column in near.T:
-        total += clusters[:, column]
-    return total
+    near = tree.query(tree.data, k=count, workers=-1)[1].ravel()
+    starts = np.arange(0, len(near) + 1, count)
+    sums = csr_array((np.ones(len(near)), near, starts), shape=(tree.n, tree.n))
+    return np.stack([sums @ part for part in clusters])
 
 
 def _nearest(tree: cKDTree, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.integer[Any]]]:

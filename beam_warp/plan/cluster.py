@@ -1,4 +1,4 @@
-"""Workers on the machines of a Ray cluster: an actor for each GPU, or for each core of machines without.
+"""Workers on the machines of a Ray cluster: an actor or more for each GPU, or one for each core of machines without.
 
 Ray starts processes, notices when they or their machines end, and carries words; files go by the shared folder, and
 that each step is done once is due to receipts and renames. Actors are replaced, not restarted: a new one may land on
@@ -29,8 +29,8 @@ MOST_DEATHS = 8
 """Actors in a row that may end before they are ready: machines fail, but not all of them."""
 
 
-def cluster_at(words: str) -> Crew:
-    """Return the workers of a cluster: ``ray`` for that of this machine, or ``ray://HOST:PORT``.
+def cluster_at(words: str, each: int = 1) -> Crew:
+    """Return the workers of a cluster, ``ray`` for that of this machine or ``ray://HOST:PORT``, ``each`` on a GPU.
 
     Raises:
         InvalidOptionError: There is no address.
@@ -46,7 +46,7 @@ def cluster_at(words: str) -> Crew:
             "beam-warp[cluster]."
         ) from error
     address = "auto" if words == "ray" else words
-    return lambda plan, kind, progress: Cluster(ray, address, plan, kind)
+    return lambda plan, kind, progress: Cluster(ray, address, plan, kind, each)
 
 
 def _require_open(address: str) -> None:
@@ -63,20 +63,21 @@ def _require_open(address: str) -> None:
 class Cluster:
     """Actors of a Ray cluster."""
 
-    def __init__(self, ray: Any, address: str, plan: Plan, kind: str) -> None:
-        """Connect, and ask for an actor for each GPU or core.
+    def __init__(self, ray: Any, address: str, plan: Plan, kind: str, each: int = 1) -> None:
+        """Connect, and ask for actors for each GPU, or one for each core.
 
         Args:
             ray: The package.
             address: Of the cluster.
             plan: What is to be done.
             kind: Kind of device that it is for.
+            each: Actors that share a GPU.
 
         Raises:
             InvalidOptionError: There is no cluster, or the work cannot be sent to another process.
         """
         self.count = 0
-        self._ray, self._kind = ray, kind
+        self._ray, self._kind, self._each = ray, kind, each if kind == "cuda" else 1
         try:
             _require_open(os.environ.get("RAY_ADDRESS", "") if address == "auto" else address)
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
@@ -87,7 +88,7 @@ class Cluster:
             ) from error
         self._terms = Terms.of(plan.folder, kind)
         self._packed = packed(plan.works, self._terms)
-        needs = {"num_gpus": 1} if kind == "cuda" else {"num_cpus": 1}
+        needs = {"num_gpus": 1.0 / each} if kind == "cuda" else {"num_cpus": 1}
         self._actor = ray.remote(**needs, max_restarts=0, max_task_retries=0)(_Actor)
         self._members: list[_Member] = []
         self._looked = -LOOK_PERIOD
@@ -138,7 +139,7 @@ class Cluster:
             return
         self._looked = time.monotonic()
         there = int(self._ray.cluster_resources().get("GPU" if self._kind == "cuda" else "CPU", 0))
-        self.count = min(there, self._most)
+        self.count = min(self._each * there, self._most)
         if self.count == 0 and not self._members:
             what = "GPUs" if self._kind == "cuda" else "cores"
             raise InvalidOptionError(f"workers must be machines with {what}, got a cluster without. Add one to it.")

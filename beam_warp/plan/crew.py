@@ -20,7 +20,8 @@ def crew_of(words: str, device: str | None, ahead: Sequence[str] = ()) -> Crew:
 
     Args:
         words: A number of processes; ``gpus`` for one on each GPU; ``ray`` for the Ray cluster that this machine is in;
-            ``ray://HOST:PORT`` for one that is reached as a Ray client.
+            ``ray://HOST:PORT`` for one that is reached as a Ray client. With a number before, ``3@gpus`` or ``3@ray``,
+            so many share each GPU.
         device: The device that steps are told to use; None lets every worker have its own.
         ahead: Modules that processes of this machine will need; they are imported while the caller goes on.
 
@@ -28,19 +29,21 @@ def crew_of(words: str, device: str | None, ahead: Sequence[str] = ()) -> Crew:
         InvalidOptionError: They mean nothing, or contradict the device.
         MissingPackageError: Ray is not installed.
     """
-    if words == RAY or words.startswith(f"{RAY}:"):
+    shared, at, place = words.rpartition("@")
+    each = int(shared) if shared.isdecimal() and len(shared) < 4 else 0 if at else 1
+    if each and (place == RAY or place.startswith(f"{RAY}:")):
         from beam_warp.plan.cluster import cluster_at
 
-        return cluster_at(words)
-    if words == GPUS:
+        return cluster_at(place, each)
+    if each and place == GPUS:
         if device is not None:
             raise InvalidOptionError(f"device must be left out with workers gpus, got {device}. Drop one of them.")
         serve(ahead)
-        return lambda plan, kind, progress: _processes(plan, kind, len(visible_gpus()), device)
+        return lambda plan, kind, progress: _processes(plan, kind, each * len(visible_gpus()), device)
     if not (words.isdecimal() and 1 <= int(words) <= MOST_PROCESSES):
         raise InvalidOptionError(
             f"workers must be a number from 1 to {MOST_PROCESSES}, gpus, ray or ray://HOST:PORT, got {words}. "
-            "Write 4 for four processes."
+            "Write 4 for four processes, or 3@gpus for three on each GPU."
         )
     if int(words) == 1:
         return in_process

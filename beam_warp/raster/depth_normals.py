@@ -70,7 +70,15 @@ class DepthNormals:
         steepest = math.tan(math.radians(STEEPEST)) / min(camera.focal_x, camera.focal_y)
         chosen = min(LARGEST_JUMP, steepest) if largest_jump is None else largest_jump
         view.largest_jump = require_number("largest_jump", chosen, 0.0)
-        self._view = view
+        self._views = wp.array([view], dtype=DepthNormalCamera, device=self.device)
+
+    def look_as(self, other: DepthNormals) -> None:
+        """Look from another camera of the same size from now on, also where calls were captured in a CUDA graph.
+
+        Args:
+            other: Normals of depth images of that camera, on the same device.
+        """
+        wp.copy(self._views, other._views)
 
     def write(self, depth: Any, alpha: Any, normals: wp.array) -> None:
         """Write the normals of a depth image.
@@ -86,7 +94,7 @@ class DepthNormals:
         launch_write_depth_normals(
             device_array("depth", depth, self._shape, self.device),
             device_array("alpha", alpha, self._shape, self.device),
-            self._view,
+            self._views,
             require_device_array("normals", normals, (*self._shape, 3), self.device),
             self.device,
         )
@@ -109,7 +117,7 @@ class DepthNormals:
         launch_add_depth_gradients(
             device_array("depth", depth, self._shape, self.device),
             device_array("alpha", alpha, self._shape, self.device),
-            self._view,
+            self._views,
             device_array("normal_gradients", normal_gradients, (*self._shape, 3), self.device),
             require_device_array("depth_gradients", depth_gradients, self._shape, self.device),
             self.device,

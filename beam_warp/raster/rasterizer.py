@@ -141,6 +141,11 @@ class Rasterizer:
         """
         return forward.counted_pairs(self._buffers)
 
+    def note_pair_count(self, counts: wp.array, place: int) -> None:
+        """Write what `pair_count` returns for a single band to ``counts[place]``, an int; waits for nothing."""
+        if self._buffers.splat_count:
+            wp.copy(counts, self._buffers.order.ends, place, self._buffers.splat_count - 1, 1)
+
     def draw(self, gaussians: GaussianArrays) -> RasterImages:
         """Draw Gaussians, and make room for their pairs.
 

@@ -62,8 +62,9 @@ class Silhouette:
             return None
         size = min(size, *view.alpha.shape)
         rows, columns = (count // size for count in view.alpha.shape)
-        squares = view.alpha[: rows * size, : columns * size].reshape(rows, size, columns, size)
-        away: Any = ndimage.distance_transform_edt(squares.max(axis=(1, 3)) < 0.5)  # its types allow for no distances
+        strips = view.alpha[: rows * size, : columns * size].reshape(rows, size, -1).max(axis=1)
+        squares = strips.reshape(rows, columns, size).max(axis=2)
+        away: Any = ndimage.distance_transform_edt(squares < 0.5)  # its types allow for no distances
         return cls(view.camera, away, size)
 
     def outside(self, points: NDArray[np.floating]) -> FloatArray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ from beam_warp.device.graphs import StepGraphs
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.kernels.reconstruction.gradient_sums import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
-from beam_warp.raster.records import GaussianGradients, RasterOptions
+from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.parameters import GaussianParameters, require_something
@@ -300,14 +301,21 @@ class Fitter:
         samples: Side of the square of samples of a pixel.
     """
 
-    def __init__(self, views: Sequence[CapturedView], start: GaussianCloud, options: FitOptions, device: Any) -> None:
-        """Bring everything to the device; see `fit_gaussians`."""
+    def __init__(
+        self,
+        views: Sequence[CapturedView],
+        start: GaussianCloud,
+        options: FitOptions,
+        device: Any,
+        targets: TargetSet | None = None,
+    ) -> None:
+        """Bring everything to the device, but for ``targets`` that are there already; see `fit_gaussians`."""
         self.options = options
         self.device = device
         count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
         self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
         self.samples = chosen_samples(options.samples, start, views)
-        self._targets = TargetSet(views, count, options.raster, self.samples, device)
+        self._targets = targets or TargetSet(views, count, options.raster, self.samples, device)
         center = np.median(start.positions, axis=0)
         extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
         self._limits = SamplingLimits([view.camera for view in views], device=device)
@@ -344,9 +352,9 @@ class Fitter:
             if iteration % PROGRESS_EVERY == 0:
                 self._set_rates(iteration / max(total - 1, 1))
                 progress(iteration, total, facts)
-            view = int(order[iteration])
-            self._graphs.run(view, lambda view=view: self._step(view))
-            self._stepped(view)
+            group, index = self._targets[int(order[iteration])]
+            group.select(index)
+            self._graphs.run(group.kind(index), partial(self._step, group, index))
             self._taken += 1
             is_due = bool(chosen.refine_every) and self._taken % chosen.refine_every == 0
             if is_due and self._taken <= chosen.refine_until * total:
@@ -413,28 +421,19 @@ class Fitter:
             self._graphs.clear()
         return mean_psnr(psnr)
 
-    def _step(self, view: int) -> None:
-        """Draw a view, compare, and move the Gaussians."""
-        group, index = self._targets[view]
+    def _step(self, group: ViewTargets, index: int) -> None:
+        """Draw the view that was selected, compare, and move the Gaussians."""
         parameters = self.parameters
         parameters.activate()
-        group.select(index)
         group.rasterizer.redraw()
-        drawn = self._differentiated(group, index)
+        group.add_losses(index, self._weights, values=False)
+        drawn = group.rasterizer.backward()
         launch_add_gradient_lengths(drawn.positions, self._gradient_sums, self._gradient_counts, self.device)
         parameters.zero_gradients()
         parameters.add_gradients(drawn)
         if self._temporal is not None:
             self._temporal.add_gradients(self.options.temporal)
         self._adam.step()
-
-    def _differentiated(self, group: ViewTargets, index: int) -> GaussianGradients:
-        """Compare what was drawn with a view, and return the derivatives to the Gaussians."""
-        group.add_losses(index, self._weights, values=False)
-        return group.rasterizer.backward()
-
-    def _stepped(self, view: int) -> None:
-        """Do what follows a step outside of its recording: nothing, here."""
 
     def _refine(self) -> None:
         """Drop Gaussians that are not seen, and split those of large gradients into their rows."""

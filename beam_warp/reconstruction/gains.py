@@ -16,6 +16,7 @@ from beam_warp.capture.findings import Finding
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LUMINANCE
 from beam_warp.reconstruction.initial import view_samples
+from beam_warp.reconstruction.targets import crop_views
 from beam_warp.world.gaussians import GaussianCloud
 
 EXPOSURE_STOPS = 0.3
@@ -89,7 +90,8 @@ def view_gains(
 
     Source: iteratively reweighted least squares, Holland and Welsch 1977.
     """
-    reduced = [view.reduced(max(1, min(view.camera.width, view.camera.height) // LARGEST_SIDE)) for view in views]
+    factors = [max(1, min(view.camera.width, view.camera.height) // LARGEST_SIDE) for view in views]
+    reduced = crop_views(views, factors)
     samples = view_samples(reduced, cloud, normals, device=device).numpy()
     seen = (samples[..., 3] > 0.0).sum(axis=0)
     picked = samples[:, np.linspace(0, len(cloud) - 1, min(len(cloud), MOST_POINTS)).astype(int)].astype(np.float64)

@@ -283,10 +283,14 @@ def view_samples(
     directions = upload(normals.astype(np.float32), wp.vec3, target)
     samples = wp.empty((len(views), count), dtype=wp.vec4, device=target)
     slack = DEPTH_SLACK * float(np.median(cloud.scales.max(axis=1)))
+    rasterizers: dict[tuple[int, int], Rasterizer] = {}
     for row, view in enumerate(views):
-        pixels = view.camera.width * view.camera.height
-        alpha = np.ones(pixels, np.float32) if view.alpha is None else view.alpha.reshape(-1)
-        images = Rasterizer(count, [view.camera], device=target).draw(gaussians)
+        size = (view.camera.width, view.camera.height)
+        alpha = np.ones(size[0] * size[1], np.float32) if view.alpha is None else view.alpha.reshape(-1)
+        if size not in rasterizers:
+            rasterizers[size] = Rasterizer(count, [view.camera], device=target)
+        rasterizers[size].set_cameras([view.camera])
+        images = rasterizers[size].draw(gaussians)
         image = SeenImage()
         image.view = ViewLayout.of([view.camera]).views[0]
         image.color = upload(view.color.reshape(-1, 3), wp.vec3, target)

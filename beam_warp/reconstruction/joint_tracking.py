@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -23,7 +24,7 @@ from beam_warp.reconstruction.fit import mean_psnr
 from beam_warp.reconstruction.joints.graph import JointGraph
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
-from beam_warp.reconstruction.targets import LossWeights, TargetSet, shuffled_views
+from beam_warp.reconstruction.targets import LossWeights, TargetSet, ViewTargets, shuffled_views
 from beam_warp.world.clusters import Clusters
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -119,7 +120,7 @@ class JointTracker:
         count = len(joints)
         self._cloud, self._anchors, self._joints = cloud, anchors, joints
         self._spacing = graph.spacing
-        self._all = _Carried(cloud, anchors, joints, options.blend, device)
+        self._all = self._on_joints(cloud, anchors)
         self._rigidity = RigidityLoss(graph, device=device)
         at_rest = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (count, 1))
         self._rest_rotations = upload(at_rest, wp.quat, device)
@@ -129,7 +130,12 @@ class JointTracker:
         self._position_gradients = wp.zeros(count, dtype=wp.vec3, device=device)
 
     def find(
-        self, views: Sequence[CapturedView], starts: Mapping[str, JointPose], samples: int, seed: int
+        self,
+        views: Sequence[CapturedView],
+        starts: Mapping[str, JointPose],
+        samples: int,
+        seed: int,
+        whole: TargetSet | None = None,
     ) -> tuple[JointPose, str]:
         """Move the joints until what they carry looks like the views.
 
@@ -139,6 +145,7 @@ class JointTracker:
                 far as any, is begun with.
             samples: Side of the square of samples of a pixel at full resolution.
             seed: Seed of the order of views.
+            whole: The views at full resolution, for all Gaussians, where they are on the device already.
 
         Returns:
             The poses, and the name of those that they began with.
@@ -146,35 +153,48 @@ class JointTracker:
         chosen, begun = self._options, next(iter(starts))
         self._pose(starts[begun])
         rng = np.random.default_rng(seed)
-        rates = {"rotations": chosen.rotation_rate, "positions": chosen.position_rate * self._spacing}
-        for index, (level, iterations) in enumerate(zip(chosen.levels, chosen.iterations, strict=True)):
-            reduced = [view.reduced(min(level, view.camera.width, view.camera.height)) for view in views]
-            carried = self._all if level == 1 else self._for_views(reduced)
-            targets = TargetSet(reduced, carried.count, self._raster, samples if level == 1 else 1, self.device)
-            adam = Adam(
-                {
-                    "rotations": Parameters(self._rotations, self._rotation_gradients, rates["rotations"]),
-                    "positions": Parameters(self._positions, self._position_gradients, rates["positions"]),
-                }
-            )
-            graphs = StepGraphs(self.device)
-            if index == 0 and len(starts) > 1:
-                likeness = {name: self._likeness(carried, targets, start) for name, start in starts.items()}
-                begun = max(likeness, key=likeness.__getitem__)
-                self._pose(starts[begun])
-            carried.carry(self._rotations, self._positions)
-            targets.make_room(carried.drawn)
-            order = shuffled_views(rng, len(targets), iterations)
-            for iteration in range(iterations):
-                for name, rate in rates.items():
-                    left = chosen.final_rate ** (iteration / iterations)
-                    adam.set_learning_rate(name, level * rate * left)
-                view = int(order[iteration])
-                graphs.run(view, partial(self._step, carried, targets, view, adam, chosen.rigidity / level**2))
+        factors = [[min(level, view.camera.width, view.camera.height) for view in views] for level in chosen.levels]
+        with ThreadPoolExecutor(1) as ahead:  # while joints are moved at one level, what the next one draws is merged
+            labels = [self._labels(views, reductions) for reductions in factors]
+            merged = [None if label is None else ahead.submit(self._merged, label) for label in labels]
+            for index, (level, iterations) in enumerate(zip(chosen.levels, chosen.iterations, strict=True)):
+                clusters = merged[index]
+                carried = self._all if clusters is None else self._on_joints(*clusters.result())
+                targets = whole if level == 1 else None
+                if targets is None:
+                    side = samples if level == 1 else 1
+                    targets = TargetSet(views, carried.count, self._raster, side, self.device, factors[index])
+                if index == 0 and len(starts) > 1:
+                    likeness = {name: self._likeness(carried, targets, start) for name, start in starts.items()}
+                    begun = max(likeness, key=likeness.__getitem__)
+                    self._pose(starts[begun])
+                order = shuffled_views(rng, len(targets), iterations)[:iterations]
+                self._move(carried, targets, order, level)
         rotations = self._rotations.numpy().astype(np.float64)
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
         positions = self._positions.numpy().copy()  # on the CPU it is the array
         return JointPose(rotations.astype(np.float32), positions), begun
+
+    def _move(self, carried: _Carried, targets: TargetSet, order: NDArray[np.int64], level: int) -> None:
+        """Move the joints at one level, by a step for each number of a view in ``order``."""
+        chosen = self._options
+        rates = {"rotations": level * chosen.rotation_rate, "positions": level * (chosen.position_rate * self._spacing)}
+        adam = Adam(
+            {
+                "rotations": Parameters(self._rotations, self._rotation_gradients, rates["rotations"]),
+                "positions": Parameters(self._positions, self._position_gradients, rates["positions"]),
+            }
+        )
+        graphs = StepGraphs(self.device)
+        carried.carry(self._rotations, self._positions)
+        targets.make_room(carried.drawn)
+        for iteration, view in enumerate(order):
+            for name, rate in rates.items():
+                adam.set_learning_rate(name, rate * chosen.final_rate ** (iteration / len(order)))
+            group, place = targets[int(view)]
+            group.select(place)
+            step = partial(self._step, carried, group, place, adam, chosen.rigidity / level**2)
+            graphs.run(group.kind(place), step)
 
     def _pose(self, pose: JointPose) -> None:
         """Put the joints somewhere."""
@@ -195,22 +215,29 @@ class JointTracker:
         positions = self._all.drawn.positions.numpy().copy()  # on the CPU it is the array
         return cloud.with_arrays(positions=positions, orientations=orientations.astype(np.float32))
 
-    def _for_views(self, views: Sequence[CapturedView]) -> _Carried:
-        """Return what is drawn into reduced views: no more than `GAUSSIANS_PER_PIXEL`, as far as coverage is known."""
-        pixels = float(np.mean([np.inf if view.alpha is None else view.alpha.sum() for view in views]))
+    def _labels(self, views: Sequence[CapturedView], reductions: Sequence[int]) -> NDArray[np.int64] | None:
+        """Return what merges for reduced views, so that no more than `GAUSSIANS_PER_PIXEL` are drawn; None for nothing.
+
+        Nothing merges at full resolution, and where coverage is not known.
+        """
+        if max(reductions) == 1 or any(view.alpha is None for view in views):
+            return None
+        pixels = float(np.mean([view.covered / factor**2 for view, factor in zip(views, reductions, strict=True)]))
         size = int(len(self._cloud) / max(2 * GAUSSIANS_PER_PIXEL * pixels, 1.0))
-        if size < 2:
-            return self._all
-        labels = hanging_together(self._cloud, self._anchors, size, self.device)
+        return None if size < 2 else hanging_together(self._cloud, self._anchors, size, self.device)
+
+    def _merged(self, labels: NDArray[np.int64]) -> tuple[GaussianCloud, Anchors]:
+        """Return the Gaussians that clusters are, and what carries each."""
         merged = Clusters(self._cloud, labels, np.ones(len(self._cloud)))
         anchors = Anchors(self._anchors.joints[merged.heaviest], self._anchors.weights[merged.heaviest])
-        return _Carried(merged.cloud(self._cloud), anchors, self._joints, self._options.blend, self.device)
+        return merged.cloud(self._cloud), anchors
 
-    def _step(self, carried: _Carried, targets: TargetSet, view: int, adam: Adam, rigidity: float) -> None:
-        """Draw a view, compare, and move the joints."""
-        group, index = targets[view]
+    def _on_joints(self, cloud: GaussianCloud, anchors: Anchors) -> _Carried:
+        return _Carried(cloud, anchors, self._joints, self._options.blend, self.device)
+
+    def _step(self, carried: _Carried, group: ViewTargets, index: int, adam: Adam, rigidity: float) -> None:
+        """Draw the view that was selected, compare, and move the joints."""
         carried.carry(self._rotations, self._positions)
-        group.select(index)
         group.rasterizer.redraw()
         group.add_losses(index, self._options.weights, values=False)
         drawn = group.rasterizer.backward()

@@ -26,6 +26,7 @@ Welsch 1977; the split sum, Karis 2013.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -227,11 +228,14 @@ def solve_gains(samples: NDArray[np.floating], gloss: NDArray[np.floating]) -> S
     scale = means[rows, None, :]
     relative, seen = colors[:, rows].transpose(1, 0, 2) / scale, weights[:, rows].T
     shine = gloss[:, rows].transpose(1, 0, 2, 3) / scale[..., None]
-    logs = _Solver(relative, seen, shine).solve()
-    matte = _Solver(relative, seen, shine[..., :0]).solve()
     levels = means[rows] @ LUMINANCE
     is_bright = levels > np.median(levels)
-    bright, dark = (_Solver(relative[half], seen[half], shine[half]).solve() for half in (is_bright, ~is_bright))
+    every = np.ones(len(rows), bool)
+    asked = ((every, shine), (every, shine[..., :0]), (is_bright, shine), (~is_bright, shine))
+    with ThreadPoolExecutor(len(asked)) as pool:
+        logs, matte, bright, dark = pool.map(
+            lambda it: _Solver(relative[it[0]], seen[it[0]], it[1][it[0]]).solve(), asked
+        )
     return SolvedGains(logs, 0.5 * (bright - dark), 0.5 * (logs - matte))
 
 

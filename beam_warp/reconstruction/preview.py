@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from beam_warp.capture.views import CapturedView
+from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.files import display_image
-from beam_warp.image.metrics import block_means
 from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.kernels.reconstruction.display_encoding import launch_average
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
-from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS
-from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.sources import upload_gaussians
+from beam_warp.raster.view_images import view_images
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -66,18 +69,12 @@ def reconstruction_preview(
         8-bit sRGB, ``(H, W, 3)``.
     """
     factor = _reduction(views[0].camera, MOST_ROWS)
-    views, side = [view.reduced(factor) for view in views], samples * factor
-    cameras = [view.camera.supersampled(side) for view in views]
-    buffers = rasterize(cloud, cameras, channels=(RADIANCE, SURFACE_NORMALS), options=options, device=device)
+    views = [view.reduced(factor) for view in views]
+    drawn = _drawn(cloud, [view.camera for view in views], samples * factor, options, device)
     panels: list[Panel] = []
-    for index, (view, buffer) in enumerate(zip(views, buffers, strict=True)):
-        alpha = block_means(buffer.alpha, side)[..., None]
-        radiance, normals = (
-            _straight(block_means(buffer.channels[name] * buffer.alpha[..., None], side), alpha)
-            for name in (RADIANCE, SURFACE_NORMALS)
-        )
+    for index, (view, (radiance, normals, alpha)) in enumerate(zip(views, drawn, strict=True)):
         photograph = _shown(view)
-        render = over_background(display_image(radiance) / 255.0, alpha)
+        render = over_background(display_image(_straight(radiance, alpha)) / 255.0, alpha)
         difference = np.abs(photograph.astype(np.int16) - render) * AMPLIFICATION
         if view.alpha is None:  # nothing is known of what lies around the subject
             difference = np.rint(difference * alpha)
@@ -85,7 +82,7 @@ def reconstruction_preview(
             (f"{view.name}: photograph", photograph),
             ("render", render),
             (f"difference, {AMPLIFICATION} times", np.minimum(difference, 255).astype(np.uint8)),
-            ("normals (x, y, z as r, g, b)", over_background(0.5 * normals + 0.5, alpha)),
+            ("normals (x, y, z as r, g, b)", over_background(0.5 * _straight(normals, alpha) + 0.5, alpha)),
         ]
         if shadings:
             row.append(("mesh", shadings[index]))
@@ -122,6 +119,31 @@ def mesh_shadings(
         return []
     seeing = [cameras[index].reduced(_reduction(cameras[index], MOST_ROWS)) for index in shown]
     return [shaded_image(mesh, camera, device=device) for camera in seeing]
+
+
+def _drawn(
+    cloud: GaussianCloud, cameras: Sequence[Camera], side: int, options: RasterOptions | None, device: str | None
+) -> Iterator[tuple[NDArray[np.float32], ...]]:
+    """Draw a cloud for cameras of one size: colour and normals times alpha, ``(H, W, 3)``, and alpha ``(H, W, 1)``.
+
+    Each pixel is the mean of ``side`` x ``side`` samples, taken where they are drawn: they are many.
+    """
+    target, fine = resolve_device(device), [camera.supersampled(side) for camera in cameras]
+    gaussians = upload_gaussians(cloud, target, radiance=cloud.radiance)
+    rasterizer = Rasterizer(len(cloud), fine[:1], radiance=True, normals=True, options=options, device=target)
+    for camera in fine:
+        rasterizer.set_cameras([camera])
+        rasterizer.draw(gaussians)
+        (image,) = view_images(rasterizer)
+        samples = (
+            image.select(rasterizer.color_channels),
+            image.select(rasterizer.normal_channels),
+            image.alpha.reshape((camera.height, camera.width, 1)),
+        )
+        means = [wp.empty((camera.height // side, camera.width // side, it.shape[2]), float, target) for it in samples]
+        for part, mean in zip(samples, means, strict=True):
+            launch_average(part, side, False, mean, target)
+        yield tuple(mean.numpy() for mean in means)
 
 
 def _reduction(camera: Camera, most_rows: int) -> int:

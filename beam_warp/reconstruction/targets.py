@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,8 +16,8 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_number
 from beam_warp.device.array_checks import pixel_channels
 from beam_warp.device.arrays import upload
+from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidOptionError
-from beam_warp.image.color import linear_to_srgb
 from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
     launch_add_sample_gradients,
@@ -78,37 +78,45 @@ class LossWeights:
             )
 
 
-def crop_views(views: Sequence[CapturedView]) -> list[CapturedView]:
+def crop_views(views: Sequence[CapturedView], reductions: Sequence[int] | None = None) -> list[CapturedView]:
     """Return the parts of the views where the subject is, of one size for all that have the same resolution.
 
     Views whose coverage is not known stay whole. Renders and losses cost as much as there are pixels.
+
+    Args:
+        views: What the cameras saw.
+        reductions: By which factor each view is reduced: sizes and margins are then those of reduced pixels. None
+            leaves all as they are.
     """
-    boxes = [_box(view) for view in views]
+    factors = reductions or [1] * len(views)
+    wholes = [
+        (view.camera.width // factor, view.camera.height // factor) for view, factor in zip(views, factors, strict=True)
+    ]
+    boxes = [_box(view, factor, whole) for view, factor, whole in zip(views, factors, wholes, strict=True)]
     sizes: dict[tuple[int, int], list[int]] = {}
-    for view, box in zip(views, boxes, strict=True):
-        largest = sizes.setdefault((view.camera.width, view.camera.height), [CROP_STEP, CROP_STEP])
+    for whole, box in zip(wholes, boxes, strict=True):
+        largest = sizes.setdefault(whole, [CROP_STEP, CROP_STEP])
         for axis in range(2):
             side = box[1][axis] - box[0][axis] + 2 * CROP_MARGIN
             largest[axis] = max(largest[axis], -(-side // CROP_STEP) * CROP_STEP)
     result = []
-    for view, (low, high) in zip(views, boxes, strict=True):
-        whole = (view.camera.width, view.camera.height)
+    for view, factor, whole, (low, high) in zip(views, factors, wholes, boxes, strict=True):
         size = [min(side, full) for side, full in zip(sizes[whole], whole, strict=True)]
         starts = [
             int(np.clip((low[axis] + high[axis] - size[axis]) // 2, 0, whole[axis] - size[axis])) for axis in range(2)
         ]
-        result.append(view.cropped(*starts, *size))
+        result.append(view.cropped(*(factor * number for number in (*starts, *size))).reduced(factor))
     return result
 
 
-def _box(view: CapturedView) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the first column and row of the subject, and the ones after its last."""
-    if view.alpha is None:
-        return (0, 0), (view.camera.width, view.camera.height)
-    rows, columns = (np.flatnonzero((view.alpha > 0.0).any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return (0, 0), (0, 0)
-    return (int(columns[0]), int(rows[0])), (int(columns[-1]) + 1, int(rows[-1]) + 1)
+def _box(view: CapturedView, factor: int, whole: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the first column and row of the subject in a reduced view, and the ones after its last."""
+    if view.subject is None:
+        return (0, 0), whole
+    (left, top), (right, bottom) = view.subject
+    end = min(-(-right // factor), whole[0]), min(-(-bottom // factor), whole[1])
+    start = left // factor, top // factor
+    return (start, end) if start[0] < end[0] and start[1] < end[1] else ((0, 0), (0, 0))
 
 
 class ViewTargets:
@@ -137,14 +145,16 @@ class ViewTargets:
         cameras = tuple(view.camera.supersampled(samples) for view in views)
         self.cameras = cameras
         self._weigher: Rasterizer | None = None
+        self._drawn: GaussianArrays | None = None
         self.rasterizer = Rasterizer(
             gaussian_count, cameras[:1], radiance=True, normals=True, options=options, device=device
         )
         self.device = self.rasterizer.device
+        self._looks = StepGraphs(self.device)
         self.height, self.width = views[0].camera.height, views[0].camera.width
         self.samples = samples
         self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
-        self._colors = [upload(linear_to_srgb(view.color), float, self.device) for view in views]
+        self._colors = [_encoded(view.color, self.device) for view in views]
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
@@ -153,6 +163,12 @@ class ViewTargets:
             self.height * self.width if view.alpha is None else int((view.alpha > 0.5).sum()) for view in views
         ]
         self._depth_normals = [DepthNormals(camera, device=self.device) for camera in cameras]
+        # What a view is compared with lies where the one before was, so that a recorded step fits all of one kind.
+        self._target, self._geometry = wp.empty_like(self._colors[0]), DepthNormals(cameras[0], device=self.device)
+        self._target_alpha, self._doubt = (
+            next((wp.empty_like(it) for it in arrays if it is not None), None)
+            for arrays in (self._alphas, self._doubts)
+        )
         size, fine = (self.height, self.width), (cameras[0].height, cameras[0].width)
         images, adjoints = self.rasterizer.images, self.rasterizer.adjoints()
         colors, normals = self.rasterizer.color_channels.start, self.rasterizer.normal_channels.start
@@ -176,11 +192,23 @@ class ViewTargets:
         self._sums = SumBuffers(self.device)
 
     def select(self, index: int) -> None:
-        """Look from a view; may be captured in a CUDA graph."""
+        """Look from a view, and bring what it is compared with to where `add_losses` finds it; waits for nothing."""
         self.rasterizer.set_cameras(self._cameras[index])
+        self._geometry.look_as(self._depth_normals[index])
+        for place, kept in (
+            (self._target, self._colors[index]),
+            (self._target_alpha, self._alphas[index]),
+            (self._doubt, self._doubts[index]),
+        ):
+            if kept is not None:
+                wp.copy(place, kept)
+
+    def kind(self, index: int) -> Hashable:
+        """Return what views have in common that are compared by the same launches, when each was selected before."""
+        return self, self._alphas[index] is None, self._doubts[index] is None
 
     def move_camera(self, index: int, camera: Camera) -> None:
-        """Draw a view from another camera from now on, also where steps were recorded.
+        """Draw a view from another camera from now on.
 
         Normals of depth keep the camera that the view began with.
 
@@ -189,13 +217,11 @@ class ViewTargets:
             camera: Its camera, with the view's size.
         """
         fine = camera.supersampled(self.samples)
-        moved = self.rasterizer.prepare_cameras([fine])
-        wp.copy(self._cameras[index].views, moved.views)
-        self._cameras[index] = PreparedCameras(moved.cameras, moved.layout, self._cameras[index].views)
+        self._cameras[index] = self.rasterizer.prepare_cameras([fine])
         self.cameras = (*self.cameras[:index], fine, *self.cameras[index + 1 :])
 
     def add_losses(self, index: int, weights: LossWeights, *, values: bool = True) -> list[wp.array]:
-        """Compare what was drawn last with a view, and write the derivatives to the rasteriser's adjoints.
+        """Compare what was drawn last with the selected view, and write the derivatives to the rasteriser's adjoints.
 
         What is not known of a pixel is taken to be what was drawn.
 
@@ -206,7 +232,7 @@ class ViewTargets:
         self._adjoints.zero_()
         self._to_encoded.zero_()
         launch_average(self._color, self.samples, True, self._encoded, self.device)
-        target, doubt = self._colors[index], self._doubts[index]
+        target, doubt = self._target, None if self._doubts[index] is None else self._doubt
         launch_believe(doubt, target, self._encoded, self.device)
         terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded, value=values)]
         if weights.ssim > 0.0:
@@ -215,7 +241,7 @@ class ViewTargets:
             )
         launch_believe(doubt, None, self._to_encoded, self.device)
         launch_add_sample_gradients(self._color, self.samples, True, self._to_encoded, self._to_color, self.device)
-        alpha = self._alphas[index]
+        alpha = None if self._alphas[index] is None else self._target_alpha
         if alpha is not None and weights.alpha > 0.0:
             self._to_covered.zero_()
             launch_average(self._alpha, self.samples, False, self._covered, self.device)
@@ -227,8 +253,7 @@ class ViewTargets:
             launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
         if weights.normal > 0.0:
             self._to_surface.zero_()
-            geometry = self._depth_normals[index]
-            geometry.write(self._depth, self._coverage, self._surface)
+            self._geometry.write(self._depth, self._coverage, self._surface)
             terms.append(
                 self._agreement(
                     self._normal,
@@ -241,7 +266,7 @@ class ViewTargets:
                     value=values,
                 )
             )
-            geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
+            self._geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
         return terms
 
     def shares(self, index: int, gaussians: GaussianArrays) -> NDArray[np.float32]:
@@ -262,21 +287,43 @@ class ViewTargets:
         return values.numpy()[:, 0] / np.float32(self.samples**2)
 
     def psnr(self, index: int) -> float:
-        """Return the PSNR of what was drawn last against a view, encoded and clipped to [0, 1] [dB].
+        """Return the PSNR of what was drawn last against a view, see `decibels`; waits for the device."""
+        self.write_error(index, self._error)
+        return self.decibels(index, float(self._error.numpy()[0]))
+
+    def write_error(self, index: int, out: wp.array) -> None:
+        """Write the mean square error of what was drawn last against a view to ``out[0]``, encoded and clipped."""
+        launch_average(self._color, self.samples, True, self._encoded, self.device)
+        launch_square_error(self._errors.size, self._encoded, self._colors[index], self._errors, self.device)
+        launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, out, self.device)
+
+    def decibels(self, index: int, error: float) -> float:
+        """Return the PSNR of a mean square error of colours in [0, 1] [dB].
 
         NaN for a view that shows nothing of the subject: black is easily met, and says nothing.
         """
         if self._alphas[index] is not None and not self._subjects[index]:
             return math.nan
-        launch_average(self._color, self.samples, True, self._encoded, self.device)
-        launch_square_error(self._errors.size, self._encoded, self._colors[index], self._errors, self.device)
-        launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, self._error, self.device)
-        return -10.0 * math.log10(max(float(self._error.numpy()[0]), 1e-12))
+        return -10.0 * math.log10(max(error, 1e-12))
 
     def draw(self, index: int, gaussians: GaussianArrays) -> None:
         """Draw Gaussians for a view, with as much room as they take."""
         self.select(index)
+        self._looks.clear()
         self.rasterizer.draw(gaussians)
+        self._drawn = gaussians
+
+    def look(self, index: int, gaussians: GaussianArrays) -> None:
+        """Draw Gaussians for a view; waits for nothing, and makes no room, if the same arrays were drawn before."""
+        if not self.has_drawn(gaussians):
+            self.draw(index, gaussians)
+            return
+        self.select(index)
+        self._looks.run("redraw", self.rasterizer.redraw)
+
+    def has_drawn(self, gaussians: GaussianArrays) -> bool:
+        """Tell whether these arrays were drawn last."""
+        return self._drawn is gaussians
 
     def compared(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return what was drawn last and a view with coverage, encoded, ``(H, W, 4)`` each, and depth ``(H, W)`` [m].
@@ -310,6 +357,14 @@ class ViewTargets:
         return largest / max(self._subjects[index], 1)
 
 
+def _encoded(color: NDArray[np.float32], device: Any) -> wp.array:
+    """Bring scene-linear colour to a device, and encode it there as renders are."""
+    linear = upload(color, float, device)
+    encoded = wp.empty_like(linear)
+    launch_average(linear, 1, True, encoded, device)
+    return encoded
+
+
 class TargetSet:
     """Views of any sizes, each at hand by its number.
 
@@ -318,15 +373,23 @@ class TargetSet:
     """
 
     def __init__(
-        self, views: Sequence[CapturedView], gaussian_count: int, options: RasterOptions, samples: int, device: Any
+        self,
+        views: Sequence[CapturedView],
+        gaussian_count: int,
+        options: RasterOptions,
+        samples: int,
+        device: Any,
+        reductions: Sequence[int] | None = None,
     ) -> None:
-        """Crop views to the subject and bring them to a device; see `ViewTargets`."""
+        """Crop views to the subject, reduce them and bring them to a device; see `ViewTargets` and `crop_views`."""
         by_size: dict[tuple[int, int], list[int]] = {}
-        cropped = crop_views(views)
+        cropped = crop_views(views, reductions)
         for number, view in enumerate(cropped):
             by_size.setdefault((view.camera.width, view.camera.height), []).append(number)
         self.device = device
         self._places: list[tuple[ViewTargets, int]] = [None] * len(cropped)  # type: ignore[list-item]
+        self._errors = wp.zeros(len(cropped), dtype=float, device=device)
+        self._pairs = wp.zeros(len(cropped), dtype=int, device=device)
         self._groups = []
         for numbers in by_size.values():
             group = ViewTargets([cropped[number] for number in numbers], gaussian_count, options, samples, device)
@@ -349,14 +412,27 @@ class TargetSet:
             PSNR of each crop, encoded and clipped to [0, 1] [dB], NaN where nothing of the subject is, ``(V,)``; and
             whether room had to be made: then what was recorded with the old arrays must be recorded again.
         """
-        before = [group.rasterizer.pair_capacity for group in self._groups]
-        psnr = []
-        for group, index in self._places:
+        before, are_others = self._rooms(), not all(group.has_drawn(gaussians) for group in self._groups)
+        room = []
+        for number, (group, index) in enumerate(self._places):
+            group.look(index, gaussians)
+            group.write_error(index, self._errors[number : number + 1])
+            group.rasterizer.note_pair_count(self._pairs, number)
+            room.append(group.rasterizer.pair_capacity)
+        for number in np.flatnonzero(self._pairs.numpy() > room):
+            group, index = self._places[number]
             group.draw(index, gaussians)
-            psnr.append(group.psnr(index))
-        for group in self._groups:
-            group.rasterizer.backward()  # allocates what the way back needs, which a recording must not
-        return np.array(psnr), before != [group.rasterizer.pair_capacity for group in self._groups]
+            group.write_error(index, self._errors[number : number + 1])
+        is_new = before != self._rooms()
+        if is_new or are_others:
+            for group in self._groups:
+                group.rasterizer.backward()  # allocates what the way back needs, which a recording must not
+        errors = self._errors.numpy()
+        psnr = [group.decibels(index, float(errors[k])) for k, (group, index) in enumerate(self._places)]
+        return np.array(psnr), is_new
+
+    def _rooms(self) -> list[int]:
+        return [group.rasterizer.pair_capacity for group in self._groups]
 
     def shares(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
         """Return what each Gaussian shows of itself over all views: its weights summed over pixels, ``(N,)``."""
@@ -379,10 +455,10 @@ class TargetSet:
         return total
 
     def gaps(self, gaussians: GaussianArrays) -> NDArray[np.float64]:
-        """Draw every view, and return the largest gap in each, ``(V,)``; see `ViewTargets.gap`."""
+        """Draw every view, after `make_room`, and return the largest gap in each, ``(V,)``; see `ViewTargets.gap`."""
         gaps = []
         for group, index in self._places:
-            group.draw(index, gaussians)
+            group.look(index, gaussians)
             gaps.append(group.gap(index))
         return np.array(gaps)
 

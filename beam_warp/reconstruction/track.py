@@ -248,7 +248,8 @@ def advance_track(
     samples = chosen_samples(chosen.samples, track.cloud, views)
     tracker = JointTracker(track.cloud, track.anchors, track.graph, track.joints, options.joints, chosen.raster, target)
     starts = _starts(track, views, options, target)
-    pose, begun = tracker.find(views, starts, samples, chosen.seed)
+    targets = TargetSet(views, len(track.cloud), chosen.raster, samples, target)
+    pose, begun = tracker.find(views, starts, samples, chosen.seed, targets)
     carried = tracker.carried(track.cloud)
     refinement = replace(
         chosen,
@@ -258,7 +259,7 @@ def advance_track(
         samples=samples,
         sampling_filter=False,  # it is in the scales already
     )
-    fitter = Fitter(views, carried, refinement, target)
+    fitter = Fitter(views, carried, refinement, target, targets)
     fitter.run(progress)
     cloud = fitter.parameters.cloud().with_arrays(ids=track.cloud.ids)
     psnr, gaps = fitter.psnr(), fitter.gaps()

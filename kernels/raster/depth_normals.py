@@ -89,9 +89,10 @@ def write_depth_normals_kernel(
     first: int,
     depth: wp.array2d[float],
     alpha: wp.array2d[float],
-    view: DepthNormalCamera,
+    views: wp.array[DepthNormalCamera],
     out_normals: wp.array3d[float],
 ):
+    view = views[0]
     pixel = first + wp.tid()
     x = pixel % depth.shape[1]
     y = pixel / depth.shape[1]
@@ -148,10 +149,11 @@ def add_depth_gradients_kernel(
     first: int,
     depth: wp.array2d[float],
     alpha: wp.array2d[float],
-    view: DepthNormalCamera,
+    views: wp.array[DepthNormalCamera],
     normal_gradients: wp.array3d[float],
     out_depth_gradients: wp.array2d[float],
 ):
+    view = views[0]
     # A gather: a pixel asks the four normals that read it, in this order, so that no two threads write one sum.
     pixel = first + wp.tid()
     x = pixel % depth.shape[1]
@@ -163,12 +165,12 @@ def add_depth_gradients_kernel(
     out_depth_gradients[y, x] += total
 
 
-def launch_write_depth_normals(depth, alpha, view, out_normals, device):
-    """Write the normals of every pixel."""
-    launch(write_depth_normals_kernel, depth.size, inputs=[depth, alpha, view], outputs=[out_normals], device=device)
+def launch_write_depth_normals(depth, alpha, views, out_normals, device):
+    """Write the normals of every pixel; the only one of ``views`` is the camera."""
+    launch(write_depth_normals_kernel, depth.size, inputs=[depth, alpha, views], outputs=[out_normals], device=device)
 
 
-def launch_add_depth_gradients(depth, alpha, view, normal_gradients, out_depth_gradients, device):
+def launch_add_depth_gradients(depth, alpha, views, normal_gradients, out_depth_gradients, device):
     """Add to the gradients of every pixel's depth, from those of the normals."""
-    inputs = [depth, alpha, view, normal_gradients]
+    inputs = [depth, alpha, views, normal_gradients]
     launch(add_depth_gradients_kernel, depth.size, inputs=inputs, outputs=[out_depth_gradients], device=device)

@@ -14,6 +14,7 @@ from support.fake_steps import write_capture
 from beam_warp.capture.capture import Capture
 from beam_warp.capture.corrections import CameraCorrection, RigCorrection, moved_camera
 from beam_warp.capture.findings import Finding
+from beam_warp.stability.flaws.write import FLAWS
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import sh_basis
 
@@ -41,6 +42,18 @@ def test_names_stand_for_flaws():
     assert benchmark.flaws_of("clean") == ()
     assert set(benchmark.flaws_of("flawed")) == {"exposure", "noise", "masks", "poses", "light"}
     assert benchmark.flaws_of("masks+poses") == ("masks", "poses")
+
+
+def test_several_flaws_have_a_row_of_few_words():
+    scores = {name: {"psnr": 30.0, "ssim": 0.9} for name in (*tables_flaws.IMAGES, "roughness")}
+    scores |= {"base_color_scale": 1.0, "normals_median_degrees": 2.0, "depth_median_mm": 3.0}
+    cases = [("walker", "masks"), ("walker", "noise+masks+poses")]
+    rows = [
+        {"case": {"capture": capture, "flaw": flaw, "size": 1.0}, "scores": scores, "named": {}, "beside": []}
+        for capture, flaw in cases
+    ]
+    labels = [row[0] for row in tables_flaws.flaws({"rows": rows})[1:]]
+    assert labels == [FLAWS["masks"], "noise, masks and poses at once"]
 
 
 @pytest.mark.parametrize(

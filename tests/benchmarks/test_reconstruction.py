@@ -8,7 +8,18 @@ import pytest
 import reconstruction as benchmark
 import tables_reconstruction as tables
 import trimesh
-from reconstruction_captures import halved, refined, texture, textured_meshes, write_large_capture
+from reconstruction_captures import (
+    CASE,
+    PUT_DOWN,
+    box,
+    case_places,
+    halved,
+    refined,
+    subdivided,
+    texture,
+    textured_meshes,
+    write_large_capture,
+)
 from reconstruction_contenders import Contender, follow
 from support.tracked_balls import tracked_balls
 
@@ -107,6 +118,25 @@ class TestCapture:
         known, written = read_truth_mesh(tiny_capture, 1), read_truth_mesh(capture, 1)
         assert np.array_equal(known.vertices, written.vertices)
         assert capture.records[0].image().alpha.max() == 1.0
+
+
+class TestCase:
+    def test_it_goes_with_the_hand_falls_straight_and_stays(self):
+        """The hand moves on, 4 cm a frame along y; the case falls half of g t² from where it was let go."""
+        hand = np.stack([np.zeros(24), 0.04 * np.arange(24), np.full(24, 0.75)], axis=1)
+        places = case_places(hand)
+        np.testing.assert_allclose(np.diff(places - hand, axis=0)[:PUT_DOWN], 0.0, atol=1e-12)
+        np.testing.assert_allclose(places[PUT_DOWN:, :2], places[PUT_DOWN, :2][None].repeat(24 - PUT_DOWN, 0))
+        assert places[PUT_DOWN, 2] - places[PUT_DOWN + 3, 2] == pytest.approx(0.5 * 9.81 * (3 / 24) ** 2)
+        assert places[-1, 2] == 0.5 * CASE[2]
+        assert (np.diff(places[:, 2]) <= 1e-12).all()
+
+    def test_it_is_a_box_that_faces_outwards(self):
+        corners, faces = box(CASE)
+        plans, fine = subdivided(faces, len(corners), 2)
+        mesh = trimesh.Trimesh(refined(corners, plans), fine, process=False)
+        assert mesh.volume == pytest.approx(np.prod(CASE))
+        np.testing.assert_allclose(mesh.bounds, [-0.5 * np.array(CASE), 0.5 * np.array(CASE)])
 
 
 class TestSections:

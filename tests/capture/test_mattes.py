@@ -82,6 +82,29 @@ def test_a_dark_limb_is_doubted_where_it_looks_like_the_wall(pixels):
     assert not found.doubt[:, :48].any()
 
 
+@pytest.mark.parametrize("pixels", [-1.0, 1.0])
+def test_limbs_that_darken_along_nearly_half_of_an_outline_do_not_move_it(pixels):
+    """Over two pixels to the wall's colour, along 45 % of a disc: a median is drawn 0.1 pixel towards them."""
+    wall = np.broadcast_to(np.array([0.1, 0.1, 0.1], np.float32), WALL.shape)
+    row, column = ROWS - 47.3, COLUMNS - 48.6
+    away = np.clip((RADIUS - np.hypot(row, column)) / 2.0, 0.0, 1.0)[..., None]
+    is_dark = (np.abs(np.arctan2(row, column)) < 0.45 * np.pi)[..., None]
+    limb = wall + (0.1 + 0.9 * away) * (SUBJECT - wall)
+    found = matte(before(wall, disc(), np.where(is_dark, limb, SUBJECT)), disc(RADIUS + pixels))
+    assert found.offset.pixels == pytest.approx(pixels, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mask_that_is_off_beyond_doubt_is_moved_as_far_as_it_is_off(seed):
+    """Texture of a fifth of the colour makes the offset uncertain by a quarter of it: no reason to leave three."""
+    texture = gaussian_filter(np.random.default_rng(seed).normal(size=WALL.shape), (1.5, 1.5, 0.0))
+    subject = np.maximum(SUBJECT * (1.0 + 0.2 * texture / texture.std()), 0.05)
+    true = disc()
+    found = matte(before(WALL, true, subject), disc(RADIUS + 1.0))
+    assert 3.0 < found.offset.pixels / found.offset.error < 4.5
+    assert (found.alpha - true).sum() < 0.3 * 2.0 * np.pi * RADIUS
+
+
 def test_masks_without_an_outline_are_left_as_they_are():
     for mask in (np.zeros((8, 8)), np.ones((8, 8)), np.random.default_rng(0).random((900, 900))):
         photograph = np.ones((*mask.shape, 3), np.float32)

@@ -81,6 +81,8 @@ class TestReconstruct:
     [
         ("reconstruct {folder} --workers some", "workers must be a number from 1 to 256, gpus, ray or ray://HOST:PORT"),
         ("reconstruct {folder} --workers 0", "workers must be a number"),
+        ("reconstruct {folder} --workers 0@gpus", "got 0@gpus. Write 4 for four processes, or 3@gpus"),
+        ("reconstruct {folder} --workers 3@4", "ray or ray://HOST:PORT, got 3@4"),
         ("reconstruct {folder} --workers gpus --device cpu", "device must be left out with workers gpus, got cpu"),
         ("reconstruct {folder} --workers ray://", "workers must name a cluster as ray://HOST:PORT, got ray://"),
         ("reconstruct {folder} --frames 7:9", "frames must hold some of the capture's 4 from 0 to 3, got 7:9"),

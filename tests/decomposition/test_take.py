@@ -15,6 +15,7 @@ from beam_warp.decomposition.frames import ReconstructedFrames
 from beam_warp.decomposition.job import OverviewOptions, run_capture
 from beam_warp.decomposition.work import MaterialWork
 from beam_warp.demo.from_images import FromImagesOptions, demo_steps
+from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.plan.crew import crew_of
 from beam_warp.plan.standing import look
@@ -58,6 +59,21 @@ def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
     assert one.result.report["materials"] == two.result.report["materials"]
     assert one.result.report["workers"] != two.result.report["workers"]
     assert look(tmp_path / "two").stages["materials"].done == 4
+
+
+def test_frames_that_roughness_is_found_from_are_looked_at_once(ball, tmp_path, monkeypatch):
+    """All frames of so short a take are: what their views show is kept until they are measured."""
+    looked = []
+
+    def counted(*arguments, **options):
+        looked.append(len(arguments[0]))
+        return view_evidence(*arguments, **options)
+
+    monkeypatch.setattr("beam_warp.decomposition.seen.view_evidence", counted)
+    options = RunOptions(materials=MaterialOptions(sample_count=8), roughness="estimate", device="cpu")
+    found = take(ball, tmp_path / "take", FakeSteps(), 0, options=options)
+    assert found.result.sequence.topology == "constant"
+    assert len(looked) == 4
 
 
 @pytest.mark.slow

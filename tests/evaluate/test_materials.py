@@ -287,6 +287,8 @@ class TestWhatIsThere:
         assert found.temporal.absent == {
             "gaussians": "the asset has one frame",
             "surface": "fewer than two frames of the asset have a true surface",
+            "occlusion_gaussians": "the asset has one frame",
+            "occlusion_surface": "fewer than two frames of the asset have a true surface",
         }
 
     def test_a_frame_without_true_base_colour_has_no_scale(self, asset, mirror, folder):

@@ -14,6 +14,7 @@ from beam_warp.capture.capture import Capture
 from beam_warp.evaluate.compared import ComparedAsset
 from beam_warp.evaluate.steadiness import (
     Deviation,
+    RunningFlicker,
     RunningVariance,
     gaussian_deviation,
     interpolated,
@@ -24,10 +25,12 @@ from beam_warp.image.color import srgb_to_linear
 from beam_warp.mesh.distances import SurfaceTree
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianSequence
 
 POINTS = 2_000
 STEP = np.array([0.05, 0.02, 0.01])
 BOTH = {0: 0, 1: 1}
+CHANNEL = "ambient_occlusion"
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +44,9 @@ def folder(relit_capture, tmp_path):
     return shutil.copytree(relit_capture.folder, tmp_path / "capture")
 
 
-def scores(sequence, capture, device, matched=MappingProxyType(BOTH)):
-    return surface_scores(ComparedAsset(sequence, capture, matched, "test"), point_count=POINTS, device=device)
+def scores(sequence, capture, device, matched=MappingProxyType(BOTH), channel="base_color"):
+    compared = ComparedAsset(sequence, capture, matched, "test")
+    return surface_scores(compared, point_count=POINTS, device=device)[channel]
 
 
 def flickering(asset, middle, step):
@@ -59,16 +63,16 @@ class TestRunningVariance:
     def test_it_is_that_of_numpy(self, rng):
         values = rng.normal(5.0, 0.1, (6, 40, 3))
         running = RunningVariance(40, 3)
-        for frame in values:
-            running.add(frame)
+        for number, frame in enumerate(values):
+            running.add(number, frame)
         expected = np.sqrt(values.var(axis=0).mean(axis=-1))
         np.testing.assert_allclose(running.deviations(), expected, rtol=1e-12)
 
     def test_missing_rows_count_for_nothing(self, rng):
         values, seen = rng.random((5, 30, 2)), rng.random((5, 30)) < 0.5
         running = RunningVariance(30, 2)
-        for frame, there in zip(values, seen, strict=True):
-            running.add(frame, there)
+        for number, (frame, there) in enumerate(zip(values, seen, strict=True)):
+            running.add(number, frame, there)
         for row, found in enumerate(running.deviations()):
             some = values[seen[:, row], row]
             if len(some) < 2:
@@ -80,6 +84,37 @@ class TestRunningVariance:
         found = Deviation.of(np.array([0.1, np.nan, 0.3]), (4, 7))
         assert (found.mean, found.count, found.frames) == (pytest.approx(0.2), 2, (4, 7))
         assert Deviation.of(np.array([np.nan]), (0, 1)) is None
+
+
+class TestRunningFlicker:
+    def test_noise_is_told_from_even_change(self, rng):
+        """Rows that change by what they like, but evenly, show the deviation of their noise alone."""
+        start, rate = rng.normal(0.0, 1.0, (2, 4_000, 1))
+        noise = rng.normal(0.0, 0.03, (10, 4_000, 1))
+        still, noisy = RunningFlicker(4_000, 1), RunningFlicker(4_000, 1)
+        for frame in range(10):
+            still.add(frame, start + frame * rate)
+            noisy.add(frame, start + frame * rate + noise[frame])
+        assert still.deviations().max() < 1e-14
+        # The variance is a mean over 32,000 second differences, of which eight in a row depend on each other.
+        assert np.sqrt((noisy.deviations() ** 2).mean()) == pytest.approx(0.03, rel=0.03)
+
+    def test_up_and_down(self):
+        """Values that go up and down by s about their mean differ by 4 s."""
+        running = RunningFlicker(1, 3)
+        for frame in range(5):
+            running.add(frame, (1.0 if frame % 2 else -1.0) * STEP[None])
+        assert running.deviations() == pytest.approx(4.0 / np.sqrt(6.0) * np.sqrt((STEP**2).mean()), rel=1e-12)
+
+    def test_only_three_frames_that_are_evenly_apart_count(self):
+        """Frames 0 1 3 5 hold one such three, and a row that is missing in it has none."""
+        running = RunningFlicker(2, 1)
+        values = {0: 9.0, 1: 1.0, 3: 1.5, 5: 1.0}
+        for frame, value in values.items():
+            running.add(frame, np.full((2, 1), value), np.array([True, frame != 3]))
+        found = running.deviations()
+        assert found[0] == pytest.approx(1.0 / np.sqrt(6.0), rel=1e-12)
+        assert np.isnan(found[1])
 
 
 class TestInterpolation:
@@ -106,6 +141,20 @@ class TestGaussians:
         expected = np.sqrt((STEP**2).mean())
         assert (found.mean, found.p95) == (pytest.approx(expected, rel=1e-5), pytest.approx(expected, rel=1e-5))
         assert (found.count, found.frames) == (len(asset[0]), (0, 1))
+
+    def test_occlusion_that_goes_up_and_down(self, asset):
+        """Three frames of half of the Gaussians' occlusion being .6, .5 and .6, of the others being steady."""
+        count = len(asset[0])
+
+        def at(frame):
+            occlusion = np.full(count, 0.6)
+            occlusion[: count // 2] -= 0.1 * (frame % 2)
+            return asset[0].with_arrays(ambient_occlusion=occlusion)
+
+        sequence = GaussianSequence.from_clouds([at(i) for i in range(3)])
+        found, expected = gaussian_deviation(sequence, (4, 5, 6), CHANNEL), 0.2 / np.sqrt(6.0)
+        assert (found.mean, found.p95) == (pytest.approx(0.5 * expected, rel=1e-3), pytest.approx(expected, rel=1e-5))
+        assert gaussian_deviation(sequence, (4, 5, 7), CHANNEL) == "no three frames of the asset are evenly apart"
 
     def test_none_without_persistence(self, asset):
         without = changed(asset, lambda _, cloud: cloud.with_arrays(ids=None))
@@ -165,6 +214,23 @@ class TestSurface:
         assert found.ours.frames == (0, 1)
         assert found.ours.count > POINTS / 4  # two cameras see about half of a figure, less what is too steep
         assert found.ours_where_known == found.ours  # the truth is drawn in both frames
+
+    def test_occlusion_that_goes_up_and_down_at_every_point(self, asset, relit_capture, folder, device):
+        """One value everywhere, .6, .5 and .6; a third frame is the second once more, and has no image."""
+        shutil.copy(folder / "truth/mesh_0001.npz", folder / "truth/mesh_0002.npz")
+        clouds = [
+            asset[min(frame, 1)].with_arrays(ambient_occlusion=np.full(len(asset[0]), value))
+            for frame, value in enumerate((0.6, 0.5, 0.6))
+        ]
+        sequence, matched = GaussianSequence.from_clouds(clouds), {0: 0, 1: 1, 2: 2}
+        found = scores(sequence, Capture.read(folder), device, matched, CHANNEL)
+        assert found.ours.mean == pytest.approx(0.2 / np.sqrt(6.0), rel=1e-4)
+        assert found.ours.p95 == pytest.approx(0.2 / np.sqrt(6.0), rel=1e-4)
+        assert found.ours.count > POINTS / 4
+        assert found.ours_where_known is found.truth is None  # two frames have no second difference
+        assert scores(sequence, relit_capture, "cpu", channel=CHANNEL) == (
+            "no point of the true surface is seen in three frames that are evenly apart by a camera"
+        )
 
     def test_a_steady_asset_is_steady(self, asset, relit_capture):
         sequence = flickering(asset, np.array([0.5, 0.4, 0.3]), 0.0)

@@ -1,7 +1,9 @@
 """Plans on a Ray cluster of three pretended machines, of which some are killed."""
 
 import os
+import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 from support.toy_work import toy_plan
@@ -59,6 +61,18 @@ def test_machines_are_killed_and_join(cluster, tmp_path):
     receipts = carry_out(plan, crew_of("ray", None)(plan, "", no_progress), harm)
     assert outputs(tmp_path / "there") == outputs(tmp_path / "here")
     assert len({receipt.worker for receipt in receipts.values()}) > 2
+
+
+@pytest.mark.parametrize(("words", "share", "count"), [("ray", 1.0, 2), ("3@ray", 1.0 / 3.0, 6)])
+def test_actors_share_gpus(tmp_path, monkeypatch, words, share, count):
+    """A cluster of two GPUs, which a mock stands in for."""
+    ray = MagicMock()
+    ray.cluster_resources.return_value = {"GPU": 2.0}
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr("beam_warp.plan.cluster._require_open", lambda address: None)
+    workers = crew_of(words, None)(toy_plan(tmp_path), "cuda", no_progress)
+    assert workers.count == count
+    assert ray.remote.call_args.kwargs["num_gpus"] == pytest.approx(share)
 
 
 @pytest.mark.parametrize("words", ["ray", "ray://127.0.0.1:1"])

@@ -94,6 +94,18 @@ class TestCrops:
         views = crop_views([masked(120, 90, None), masked(120, 90, ((50, 40), (61, 47)))])
         assert sizes(views) == [(32, 32)] * 2
 
+    @pytest.mark.parametrize("box", [((50, 40), (61, 47)), ((0, 0), (5, 5)), ((115, 80), (120, 90)), None])
+    @pytest.mark.parametrize("factor", [2, 7, 8])
+    def test_reduced_parts_are_parts_of_reduced_views(self, factor, box):
+        """Only what is left of an image is read, and it is what reducing all of it would have given."""
+        views = [masked(120, 90, box), masked(120, 90, ((30, 20), (80, 70)))]
+        for found, expected in zip(
+            crop_views(views, [factor] * 2), crop_views([view.reduced(factor) for view in views]), strict=True
+        ):
+            np.testing.assert_array_equal(found.color, expected.color)
+            np.testing.assert_array_equal(found.alpha, expected.alpha)
+            assert found.camera.center_x == pytest.approx(expected.camera.center_x, abs=1e-9)
+
     def test_without_alpha_views_stay_whole(self):
         views = [replace(masked(120, 90, None), alpha=None), masked(60, 90, ((5, 5), (6, 6)))]
         cropped = crop_views(views)
@@ -327,7 +339,10 @@ def test_room_is_made_when_more_is_drawn(device):
     assert not targets.make_room(parameters.drawn)[1]
     parameters.set_rows({"log_scales": parameters.rows()["log_scales"] + np.float32(1.5)})
     parameters.activate()
-    assert targets.make_room(parameters.drawn)[1]
+    psnr, is_new = targets.make_room(parameters.drawn)
+    assert is_new
+    fresh = TargetSet(ball_views(rig(2)), 60, RASTER, 1, targets.device)
+    np.testing.assert_array_equal(psnr, fresh.make_room(parameters.drawn)[0])  # nothing was left out for lack of room
 
 
 class TestSampleSide:

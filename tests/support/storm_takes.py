@@ -73,13 +73,13 @@ def noting(words, out):
     return crew
 
 
-def toy(out, crew):
+def toy(out, crew, device):
     """Steps that nap, and write digests of what they read."""
     plan = toy_plan(out, FRAMES, SEGMENT, seconds=NAP)
     carry_out(plan, crew(plan, "", no_progress))
 
 
-def real(out, crew, segment):
+def real(out, crew, device, segment):
     """All that ``beam run`` does with the capture beside the take's folder, in segments of a length."""
     from beam_warp.capture.capture import Capture
     from beam_warp.decomposition.frames import ReconstructedFrames
@@ -93,8 +93,8 @@ def real(out, crew, segment):
     few = FromImagesOptions(
         gaussian_count=300, color_iterations=2, normal_iterations=2, joint_iterations=2, track_iterations=2
     )
-    capture, steps = Capture.read(out.with_name("capture")), demo_steps(few, device="cpu", seed=0)
-    options = RunOptions(materials=MaterialOptions(sample_count=8), roughness="estimate", device="cpu")
+    capture, steps = Capture.read(out.with_name("capture")), demo_steps(few, device=device, seed=0)
+    options = RunOptions(materials=MaterialOptions(sample_count=8), roughness="estimate", device=device)
     frames = ReconstructionWork.prepare(
         capture, out / "reconstruction", steps, ReconstructOptions(segment_length=segment)
     )
@@ -103,17 +103,17 @@ def real(out, crew, segment):
     run_capture(frames, work, OverviewOptions(height=48), time.perf_counter(), crew)
 
 
-def draw_capture(folder):
+def draw_capture(folder, device):
     """Path trace what `real` works on."""
     from beam_warp.demo.capture import write_demo_capture
 
-    write_demo_capture(folder, frame_count=FRAMES, camera_count=6, test_camera_count=0, size=48, device="cpu")
+    write_demo_capture(folder, frame_count=FRAMES, camera_count=6, test_camera_count=0, size=48, device=device)
 
 
 TAKES = {"toy": (toy,), "real": (partial(real, segment=SEGMENT), partial(real, segment=0))}
 """Takes that follow one another, by kind: of real steps, one in segments, and one of a single segment."""
 
 
-def drive(kind, number, out, words):
+def drive(kind, number, out, words, device):
     """Carry out a take of a kind, all given as words of a command line."""
-    TAKES[kind][int(number)](Path(out), noting(words, Path(out)))
+    TAKES[kind][int(number)](Path(out), noting(words, Path(out)), device)

@@ -34,7 +34,7 @@ MetersPerUnit = Annotated[
 ]
 DropInvalid = Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")]
 Workers = Annotated[
-    str, arg(metavar="N|gpus|ray://…", help="Who works: N processes, one on each GPU, or a Ray cluster.")
+    str, arg(metavar="N|gpus|3@gpus|ray://…", help="Who works: N processes, one (or 3) on each GPU, or a Ray cluster.")
 ]
 Seed = Annotated[int, arg(help="Same seed, same device: same result.")]
 Device = Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")]

@@ -226,7 +226,7 @@ def _nearest(
     if count == 0:
         return np.zeros((len(points), 0), np.int64), np.zeros((len(points), 0))
     looked_at = min((CANDIDATES if facing is not None else 1) * count + themselves, len(joints))
-    distances, ends = cKDTree(joints).query(points, k=list(range(1, looked_at + 1)))
+    distances, ends = cKDTree(joints).query(points, k=list(range(1, looked_at + 1)), workers=-1)
     squared = distances**2
     allowed = np.ones(ends.shape, bool)
     if themselves:

@@ -111,7 +111,7 @@ def _on_surface(points: NDArray[np.float64], candidates: NDArray[np.int64], coun
     if neighbors < 2:
         return np.ones(len(candidates), bool)
     # of evenly spread candidates, so that a dense face does not decide what is usual on a coat
-    distance = cKDTree(points).query(points[candidates], k=[neighbors + 1])[0][:, 0]
+    distance = cKDTree(points).query(points[candidates], k=[neighbors + 1], workers=-1)[0][:, 0]
     usual = float(np.median(distance))
     # Eight points in a disc of that radius, len(points) on the surface: its area for each joint, and the side of that.
     spacing = usual * math.sqrt(math.pi * len(points) / (neighbors * count))
