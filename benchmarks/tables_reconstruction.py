@@ -10,7 +10,7 @@ from tables import Row, Rows, cell, figure, number, table
 
 MAIN = "reconstruction_h200.json"
 CHOICES = "reconstruction_choices_h200.json"
-STRIDES = "reconstruction_strides_cpu.json"
+STRIDES = "reconstruction_strides_h200.json"
 WALK, WITH_CASE = "steady_walk_h200.json", "steady_case_h200.json"
 EXPOSURES = "exposures_cpu.json"
 
