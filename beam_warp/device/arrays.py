@@ -17,6 +17,10 @@ from beam_warp.errors import DeviceError, InvalidArrayError
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # a library prints no banner
 
+KEPT_BYTES = 2**28
+"""Memory of a CUDA device that is kept for the next arrays rather than given back whenever the device is waited for:
+the driver takes a millisecond to find 100 MB again."""
+
 
 def resolve_device(device: str | None = None) -> Any:
     """Return the Warp device of a name; None takes the first CUDA device, or the CPU where there is none.
@@ -26,12 +30,15 @@ def resolve_device(device: str | None = None) -> Any:
     """
     _init_warp()
     if device is None:
-        return wp.get_device("cuda:0" if wp.is_cuda_available() else "cpu")
+        device = "cuda:0" if wp.is_cuda_available() else "cpu"
     try:
-        return wp.get_device(device)
+        found = wp.get_device(device)
     except Exception as error:
         known = ", ".join(str(d) for d in wp.get_devices())
         raise DeviceError(f"device must be one of {known}, got {device!r}. Choose one of them.") from error
+    if found.is_cuda and wp.is_mempool_enabled(found) and not wp.get_mempool_release_threshold(found):
+        wp.set_mempool_release_threshold(found, KEPT_BYTES)
+    return found
 
 
 def cuda_device_count() -> int:

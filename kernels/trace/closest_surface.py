@@ -2,7 +2,7 @@
 
 Hits are collected in rounds of the nearest `BUFFER_SIZE` behind the last one, in the order (t, index), so that
 coincident Gaussians are neither lost nor counted twice; then they are blended, until transmittance falls below the
-stop.
+stop. What lies behind hits that bring it there is not looked for.
 """
 
 from typing import Any
@@ -19,8 +19,12 @@ from beam_warp.kernels.trace.wide_tree import WideTree, meet_leaf
 
 wp.set_module_options({"enable_backward": False})
 
-BUFFER_SIZE = 32
-"""Hits of a round: a surface of overlapping Gaussians stops a ray after about so many."""
+BUFFER_SIZE = 48
+"""Hits of a round: a surface of overlapping Gaussians stops most rays after fewer, and a warp goes through its tree
+again for each of its rays that wants more."""
+
+DARK = wp.constant(0.9)
+"""Part of the stop below which the product of all hits is below the stop in any order, rounded or not."""
 
 HIT_THREADS = 64
 """Threads of a block of the kernels that keep hits: each has a column of shared memory."""
@@ -35,7 +39,10 @@ class HitBuffer:
 
     hits: Hits  # on the CPU; a kernel on CUDA keeps them in shared memory, of the buffer that it began last
     count: int  # hits met, those that found no place included
+    passed: float  # what the hits met let pass; -1 if that is below the stop
 
+
+READ, INSERT, SORT = (wp.constant(k) for k in range(3))
 
 _HITS = """
 #if defined(__CUDA_ARCH__)
@@ -46,24 +53,48 @@ _HITS = """
     wp::uint64* own = &buffer.hits[0];
     const int stride = 1;
 #endif
-    if (!insert)
+    // A heap, the farthest first: its root is what a nearer hit replaces.
+    const auto sink = [&](wp::uint64 sunk, int size) {
+        int to = 0;
+        for (int child = 1; child < size; child = 2 * to + 1) {
+            wp::uint64 farther = own[child * stride];
+            if (child + 1 < size && own[(child + 1) * stride] > farther)
+                farther = own[++child * stride];
+            if (sunk >= farther)
+                break;
+            own[to * stride] = farther;
+            to = child;
+        }
+        own[to * stride] = sunk;
+    };
+    if (action == 0)
         return own[place * stride];
-    if (buffer.count++ >= SIZE && hit >= own[(SIZE - 1) * stride])
-        return hit;
-    int to = wp::min(buffer.count, SIZE) - 1;
-    for (; to > 0 && hit < own[(to - 1) * stride]; --to)
-        own[to * stride] = own[(to - 1) * stride];
-    own[to * stride] = hit;
+    int size = wp::min(buffer.count, SIZE);
+    if (action == 1) {
+        ++buffer.count;
+        if (size < SIZE) {
+            for (; size > 0 && own[(size - 1) / 2 * stride] < hit; size = (size - 1) / 2)
+                own[size * stride] = own[(size - 1) / 2 * stride];
+            own[size * stride] = hit;
+        } else if (hit < own[0])
+            sink(hit, SIZE);
+    } else
+        while (--size > 0) {
+            const wp::uint64 farthest = own[0];
+            sink(own[size * stride], size);
+            own[size * stride] = farthest;
+        }
     return hit;
 """
 
 
 @wp.func_native(_HITS.replace("SIZE", str(BUFFER_SIZE)).replace("THREADS", str(HIT_THREADS)))
-def hits_of_thread(buffer: wp.ref[HitBuffer], insert: bool, hit: wp.uint64, place: int) -> wp.uint64:
-    """Sink a hit to its place in the buffer, where the last one falls out if it is full; or return the one at a place.
+def hits_of_thread(buffer: wp.ref[HitBuffer], action: int, hit: wp.uint64, place: int) -> wp.uint64:
+    """Keep a hit, in the place of the farthest if the buffer is full; sort all, nearest first; or return one.
 
-    A thread's own array lies in CUDA's local memory, where threads that look at different places wait for each other.
-    In shared memory a place of every thread has a bank of its own.
+    Threads that find hits at different times wait for each other. A heap takes a few steps for each, where a sorted
+    list took half its length. A thread's own array would lie in CUDA's local memory, where threads that look at
+    different places wait for each other; in shared memory a place of every thread has a bank of its own.
     """
     ...
 
@@ -88,19 +119,19 @@ def time_of(hit: wp.uint64) -> float: ...
 
 @wp.func
 def insert_hit(buffer: wp.ref[HitBuffer], t: float, index: int):
-    hits_of_thread(buffer, True, packed_hit(t, index), 0)
+    hits_of_thread(buffer, INSERT, packed_hit(t, index), 0)
 
 
 @wp.func
 def hit_time(buffer: wp.ref[HitBuffer], place: int) -> float:
     """``t`` of a hit."""
-    return time_of(hits_of_thread(buffer, False, wp.uint64(0), place))
+    return time_of(hits_of_thread(buffer, READ, wp.uint64(0), place))
 
 
 @wp.func
 def hit_index(buffer: wp.ref[HitBuffer], place: int) -> int:
     """Number of a hit's Gaussian."""
-    return int(hits_of_thread(buffer, False, wp.uint64(0), place) & wp.uint64(0xFFFFFFFF))
+    return int(hits_of_thread(buffer, READ, wp.uint64(0), place) & wp.uint64(0xFFFFFFFF))
 
 
 @wp.func
@@ -110,14 +141,17 @@ def insert_leaf(
     peak = meet_leaf(tree, gaussians, settings, leaf, ray.origin, ray.direction, ray.t_max)
     if peak.alpha > 0.0 and is_before(ray.t_min, ray.index_min, peak.t, peak.index):
         insert_hit(found, peak.t, peak.index)
+        found.passed *= 1.0 - peak.alpha
+        if found.passed < DARK * settings.stop:
+            found.passed = -1.0
 
 
 @wp.func
 def reach_of_buffer(ray: TracedRay, found: wp.ref[HitBuffer]) -> float:
-    """What lies behind a full buffer is passed over."""
+    """What lies behind a full buffer, or one that lets nothing pass, is passed over."""
     reach = ray.t_max
-    if found.count >= BUFFER_SIZE:
-        reach = wp.min(reach, hit_time(found, LAST))
+    if found.count >= BUFFER_SIZE or found.passed < 0.0:
+        reach = wp.min(reach, hit_time(found, 0))
     return reach
 
 
@@ -140,11 +174,15 @@ def nearest_hits(
     index_last: int,
     t_max: float,
 ) -> HitBuffer:
-    """The nearest hits behind (``t_last``, ``index_last``) and before ``t_max``."""
+    """The nearest hits behind (``t_last``, ``index_last``) and before ``t_max``, until they are below the stop."""
     ray = traced_ray(origin, direction, t_max)
     ray.t_min = t_last
     ray.index_min = index_last
-    return insert_all(tree, gaussians, settings, ray, HitBuffer())
+    buffer = HitBuffer()
+    buffer.passed = 1.0
+    buffer = insert_all(tree, gaussians, settings, ray, buffer)
+    hits_of_thread(buffer, SORT, wp.uint64(0), 0)
+    return buffer
 
 
 @wp.func
