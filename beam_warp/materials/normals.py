@@ -104,17 +104,19 @@ class SurfacePoints:
     def seen_by(
         cls, cloud: GaussianCloud, evidence: ViewEvidence, scene: Scene, offset: float | Literal["auto"] = "auto"
     ) -> SurfacePoints:
-        """Take the points that views show, and give the scene's Gaussians the normals there.
+        """Take the points that views show.
 
-        Such a point lies within the layer that shows it. So rays from it meet only what faces them: the normals of its
-        own face point along them, on the way out. With ``"auto"`` they need no lift then, which would carry them out of
-        creases. `beam_warp.trace.rays.ray_offsets` has to look for the surface first, and to leave it.
+        Such a point lies within the layer that shows it. With ``"auto"``, the scene's Gaussians get the normals there,
+        and rays from the point meet only what faces them: the normals of its own face point along them, on the way out.
+        So they need no lift, which would carry them out of creases. A stated lift has to clear the layer, for then all
+        Gaussians are in the way, as in BEAM.
 
         Args:
             cloud: The Gaussians.
             evidence: What views show of them.
-            scene: The same Gaussians, uploaded; it has normals afterwards: those of the nearest seen one for the rest.
-            offset: Lift of rays [m]; ``"auto"`` for none.
+            scene: The same Gaussians, uploaded. With ``"auto"`` it has normals afterwards: those of the nearest seen
+                one for what is not seen.
+            offset: Lift of rays [m], or ``"auto"``.
         """
         device = scene.device
         agreement = evidence.agreement.numpy()
@@ -126,12 +128,13 @@ class SurfacePoints:
         faces = _face_normals(cloud, evidence, rows, places, weights, near)
         normals = evidence.normals.numpy().copy()
         normals[rows] = faces
-        facing = normals.copy()
-        if len(rows):
-            hidden = np.flatnonzero(~evidence.seen)
-            facing[hidden] = faces[cKDTree(cloud.positions[rows]).query(cloud.positions[hidden], workers=-1)[1]]
-        scene.face(facing)
-        lift = 0.0 if offset == "auto" else require_number("offset", offset)
+        tracing, lift = (FACING, 0.0) if offset == "auto" else (EXACT, require_number("offset", offset))
+        if tracing.cull:
+            facing = normals.copy()
+            if len(rows):
+                hidden = np.flatnonzero(~evidence.seen)
+                facing[hidden] = faces[cKDTree(cloud.positions[rows]).query(cloud.positions[hidden], workers=-1)[1]]
+            scene.face(facing)
         return cls(
             evidence.positions,
             upload(normals, wp.vec3, device),
@@ -139,7 +142,7 @@ class SurfacePoints:
             evidence.seen,
             np.arccos(np.clip(agreement, 0.0, 1.0)).astype(np.float32),
             agreement,
-            FACING,
+            tracing,
         )
 
 
