@@ -79,7 +79,7 @@ class MaterialOptions:
             the light. Others get from a quarter to four times as many, those with larger errors more, as the first rays
             of their neighbours tell (`beam_warp.materials.pilot`). With 0, and for sets that do not go on
             (``"stratified"``, ``"mis"``), each gets ``sample_count``. The bounce is treated in the same way.
-        offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.trace.rays`.
+        offset: Lift of ray origins [m] or ``"auto"``; see `beam_warp.materials.normals.SurfacePoints`.
         bounce: Add one bounce from the captured radiance of what rays hit (the paper leaves it out).
         diffuse_weight: What the specular lobe leaves for diffusion, one of `DIFFUSE_WEIGHTS`.
         sampler: Sample sets; see `beam_warp.irradiance`.

@@ -148,7 +148,7 @@ def materials_study(
 _SENTENCES = {
     **SENTENCES,
     "path": "direct: rays from every Gaussian. images: rays from every pixel of every view, baked.",
-    "offset": "Lift of ray origins: auto, by what lies above the surface, or metres.",
+    "offset": "Lift of ray origins: auto, none among Gaussians that face the ray, or metres.",
     "ratio": "ratio: exact unshadowed light times a ratio of two estimates. plain: one estimate.",
     "bounce": "Light from other surfaces, by their captured radiance.",
     "weight": "What the specular lobe leaves for diffusion.",
