@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 import record
 import trimesh
-from constants_places import changed, is_option, load_packages, value_of, with_option
+from constants_places import changed, is_option, load_packages, numbers_of, value_of, with_option
 from constants_registry import GROUPS, JUDGED, SIDES, Constant
 
 from beam_warp.capture.capture import Capture, CaptureRecord
@@ -373,13 +373,14 @@ def start_worker(folders: dict[str, Path], device: str, kept: Path, setup: Setup
 
 
 def run_task(task: Task) -> Row:
-    """Return a row: every score of all captures in their order, or why there are none."""
+    """Return a row: every score of all captures in their order, what was tried, or why there are none."""
     setup: Setup = _worker["setup"]
     row: Row = {}
     try:
         with ExitStack() as stack:
             if task.place:
                 constant = next(each for each in GROUPS[task.group] if each.place == task.place)
+                row["tried"] = numbers_of([constant.tried(task.side, value_of(place)) for place in constant.places])
                 setup = _varied(constant, task.side, setup, stack)
             else:
                 setup = setup.with_seed(int(task.side))

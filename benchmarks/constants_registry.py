@@ -90,7 +90,7 @@ RECONSTRUCTION = (
     Constant(FIT + "FitOptions.weights.l1", "3DGS", "Weight of colour.", "only its ratio to the others counts"),
     Constant(FIT + "FitOptions.weights.ssim", "3DGS", "Weight of structural similarity."),
     Constant(FIT + "FitOptions.weights.alpha", WALKER, "Weight of coverage."),
-    Constant(FIT + "FitOptions.weights.normal", WALKER, "Weight of normals against the drawn depth's."),
+    Constant(FIT + "FitOptions.weights.normal", "walker, runner, robot", "Weight of normals against the depth's."),
     Constant(FIT + "FitOptions.weights.normal_tolerance", "walker, runner, robot", "Angle of an edge [rad]."),
     Constant(FIT + "FitOptions.rates.positions", WALKER, "Step of positions, in distances of the cameras."),
     Constant(FIT + "FitOptions.rates.orientations", WALKER, "Step of orientations."),

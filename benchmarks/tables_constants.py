@@ -64,7 +64,8 @@ def change(results: Sequence[Row], group: str, capture: int, row: Row | None) ->
     if row is None or "failed" in row:
         return "" if row is None else f"fails: {row['failed'].partition(':')[0]}"
     parts = []
-    for score, values in row.items():
+    for score in (key for key in row if key != "tried"):
+        values = row[score]
         difference = values[capture] - results[0]["seeds"][group]["0"][score][capture]
         text = f"{difference:+{SCORES[score][1]}}".replace("-", "−")
         parts.append(f"**{text}**" if abs(difference) > CLEAR * noise(results, group, capture, score) else text)
@@ -77,7 +78,10 @@ def written(*values: Any) -> str:
 
 
 def constant_rows(*results: Row, group: str) -> Rows:
-    """Return two rows for every constant of a group that was varied: with less of it, and with more."""
+    """Return two rows for every constant of a group that was varied: with less of it, and with more.
+
+    A row that says what was tried keeps it when the constant's value changes.
+    """
     result = results[0]
     rows: list[list[str]] = [["constant", "value", "chosen on", "tried", *result["captures"]]]
     for constant in GROUPS[group]:
@@ -85,7 +89,8 @@ def constant_rows(*results: Row, group: str) -> Rows:
             continue
         found = result["constants"].get(constant.place, {})
         for side, named in zip(SIDES, (_named(constant), [""] * 3), strict=True):
-            tried = written(*(constant.tried(side, value_of(place)) for place in constant.places))
+            now = [constant.tried(side, value_of(place)) for place in constant.places]
+            tried = written(*found.get(side, {}).get("tried", now))
             changes = [change(results, group, i, found.get(side)) for i in range(len(result["captures"]))]
             rows.append([*named, tried, *changes])
     return rows

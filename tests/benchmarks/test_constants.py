@@ -156,7 +156,8 @@ def test_rows_are_kept_and_not_made_twice(fake_runs):
         benchmark.measure(tasks, result, pool, 1, lambda: kept.append(1), until=-math.inf)
     assert len(kept) == 2  # at the end of each run
     assert result["seeds"]["reconstruction"]["0"] == "as it was"
-    assert result["constants"][SPLIT]["less"] == {"chamfer": [1.0 + 0.5 * densify.SPLIT_OFFSET]}
+    half = 0.5 * densify.SPLIT_OFFSET
+    assert result["constants"][SPLIT]["less"] == {"tried": (half,), "chamfer": [1.0 + half]}
     assert result["seeds"]["meshing"]["0"]["failed"].startswith("ZeroDivisionError")
 
 
@@ -179,6 +180,8 @@ def test_the_tables_print_changes_beyond_the_noise_in_bold():
         [f"{1.5 * value:.4g}", "**−0.31**"],
     ]
     assert rows[at][1] == f"{value:.4g}"
+    result["constants"][SPLIT]["more"]["tried"] = [0.5]  # measured when the value was another
+    assert tables_constants.constant_rows(result, group="reconstruction")[at + 1][3:] == ["0.5", "**−0.31**"]
     result["constants"][SPLIT]["less"] = {"failed": "ValueError: no"}
     assert tables_constants.constant_rows(result, group="reconstruction")[at][4] == "fails: ValueError"
     assert tables_constants.floor_rows(result, result)[1] == ["reconstruction", "surface [mm]", "2.00 ± 0.100"]
