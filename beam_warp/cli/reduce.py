@@ -63,8 +63,10 @@ class Reduce:
         tuple[Path, ...], arg(metavar="FILE ...", help="One to four lights to measure under; else the demo's three.")
     ] = ()
     height: Annotated[int, arg(metavar="PX", help="Side of compared images: how large it will be seen.")] = 256
-    pairs: Annotated[int, arg(metavar="N", help="Draws of light, camera and frame for the certificate.")] = 200
-    confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate.")] = 0.95
+    pairs: Annotated[
+        int, arg(metavar="N", help="Draws of light, camera and frame for the certificate."), SECOND_PAGE
+    ] = 200
+    confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate."), SECOND_PAGE] = 0.95
     views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 144
     steps: Annotated[
         int | None, arg(metavar="N", help="Steps of a refit; by default 2880 on a GPU, 600 elsewhere."), SECOND_PAGE
