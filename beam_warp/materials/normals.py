@@ -32,6 +32,10 @@ NEIGHBOR_COUNT = 16
 FLAT_RATIO = 0.35
 """A Gaussian whose smallest scale is below this part of its middle one has an orientation of its own."""
 
+LAYER_REACH = 3.0
+"""How far from a point of the surface a Gaussian may lie and be of that layer, in largest deviations: as far as it is
+opaque to the eye."""
+
 ORIENTATION_RAYS = 8
 SMOOTHING_PASSES = 3
 
@@ -114,8 +118,7 @@ class SurfacePoints:
         Args:
             cloud: The Gaussians.
             evidence: What views show of them.
-            scene: The same Gaussians, uploaded. With ``"auto"`` it has normals afterwards: those of the nearest seen
-                one for what is not seen.
+            scene: The same Gaussians, uploaded. With ``"auto"`` it has normals afterwards, see `_facing`.
             offset: Lift of rays [m], or ``"auto"``.
         """
         device = scene.device
@@ -130,11 +133,7 @@ class SurfacePoints:
         normals[rows] = faces
         tracing, lift = (FACING, 0.0) if offset == "auto" else (EXACT, require_number("offset", offset))
         if tracing.cull:
-            facing = normals.copy()
-            if len(rows):
-                hidden = np.flatnonzero(~evidence.seen)
-                facing[hidden] = faces[cKDTree(cloud.positions[rows]).query(cloud.positions[hidden], workers=-1)[1]]
-            scene.face(facing)
+            scene.face(_facing(cloud, evidence, normals))
         return cls(
             evidence.positions,
             upload(normals, wp.vec3, device),
@@ -202,6 +201,24 @@ def estimate_normals(
         current, following = following, current
     confidence = np.clip(certainty * np.minimum(2.0 * openness, 1.0) * agreement.numpy(), 0.0, 1.0)
     return SurfaceNormals(current.numpy(), confidence.astype(np.float32), from_shape)
+
+
+def _facing(cloud: GaussianCloud, evidence: ViewEvidence, normals: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the normals by which Gaussians face rays, ``(N, 3)``: of all that belong to a layer that views show.
+
+    Such a Gaussian lies within `LAYER_REACH` of where views show it, or is buried that near to another that does. The
+    rest is a side that no camera looks at, though a layer before it may let a little of it through: what faces there is
+    not known, and 0 faces every ray.
+    """
+    extents = LAYER_REACH * cloud.scales.max(axis=1)
+    shown = evidence.seen & (np.linalg.norm(evidence.positions.numpy() - cloud.positions, axis=1) <= extents)
+    facing = np.where(shown[:, None], normals, np.float32(0.0))
+    rows, others = np.flatnonzero(shown), np.flatnonzero(~shown)
+    if len(rows) and len(others):
+        distance, nearest = cKDTree(cloud.positions[rows]).query(cloud.positions[others], workers=-1)
+        buried = distance <= extents[rows[nearest]]
+        facing[others[buried]] = normals[rows[nearest[buried]]]
+    return facing
 
 
 def _neighbors(places: NDArray[np.float32], device: wp.Device) -> wp.array:

@@ -84,6 +84,22 @@ class TestSurface:
         assert (found.normals.numpy()[hidden] == 0.0).all()
         assert (found.agreement.numpy()[hidden] == 0.0).all()
 
+    def test_a_side_that_shines_through_faces_every_ray(self, device):
+        """The front of a ball lets a little of its back through, whose place and normal pixels cannot know."""
+        points, spacing = sphere_points(2000)
+        ball = colored(cloud_of(tiles(points, points, spacing, opacity=0.6)), np.full((2000, 3), 0.5))
+        cameras = [
+            Camera.look_at((3.0, y, 0.4), (0.0, 0.0, 0.0), width=SIDE, height=SIDE, vertical_fov=42.0)
+            for y in (-1.0, 0.0, 1.0)
+        ]
+        found, scene = view_evidence(ball, cameras, device=device), Scene.from_gaussians(ball, device)
+        SurfacePoints.seen_by(ball, found, scene)
+        normals = scene.occluders.gaussians.normals.numpy()
+        back, front = points[:, 0] < -0.5, points[:, 0] > 0.5
+        assert (found.seen[back]).mean() > 0.1
+        assert not normals[back].any()
+        assert ((normals * points)[front].sum(axis=1) > 0.9).mean() > 0.99
+
     def test_a_layer_behind_a_plane_is_moved_onto_what_is_seen(self, device):
         flat = disc_points(1.0, 0.05)
         up = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
