@@ -30,7 +30,7 @@ from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
 from beam_warp.reconstruction.joints.selection import select_joints
 from beam_warp.reconstruction.joints.skinning import Anchors
 from beam_warp.reconstruction.parameters import require_scene_linear, require_something
-from beam_warp.reconstruction.targets import LossWeights, TargetSet, chosen_samples
+from beam_warp.reconstruction.targets import TargetSet, chosen_samples
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, sh_degree_of
 
 GAUSSIANS_PER_JOINT = 25
@@ -44,10 +44,6 @@ NOISE_PSNR = 44.0
 
 SMALLEST_COSINE = 0.2
 """Least cosine between the normals of neighbours on a body: two limbs in contact are not one."""
-
-
-TRACKED = LossWeights(normal=0.5)
-"""Weights of the terms that tracked frames are met by."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +73,6 @@ class TrackOptions:
         default_factory=lambda: FitOptions(
             color_iterations=0,
             normal_iterations=400,
-            weights=TRACKED,
             rates=LearningRates(1e-4, 1e-3, 2e-3, 1e-2, 5e-3, 2.5e-4, final_positions=0.1, final_others=1.0),
             temporal=1e-3,
         )
@@ -100,13 +95,10 @@ class TrackOptions:
         return cls(joints=joints, refinement=replace(cls().refinement, normal_iterations=80))
 
     def following(self, fitting: FitOptions) -> TrackOptions:
-        """Return the options for key frames that were fitted so: drawn in the same way, met by the same terms.
-
-        But for normals: a tolerance for edges lets Gaussians slide along faces, which a key frame does not mind.
-        """
+        """Return the options for key frames that were fitted so: drawn in the same way, met by the same terms."""
         refinement = replace(
             self.refinement,
-            weights=fitting.weights if fitting.weights.normal_tolerance is None else TRACKED,
+            weights=fitting.weights,
             sh_degree=fitting.sh_degree,
             samples=fitting.samples,
             raster=fitting.raster,
