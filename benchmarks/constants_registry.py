@@ -245,6 +245,7 @@ MATERIALS = (
     Constant("beam_warp.materials.pilot:REACH", BOTH, "Neighbours whose rays tell how many a Gaussian needs."),
     Constant("beam_warp.materials.light_rays:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
+    Constant("beam_warp.materials.normals:LAYER_REACH", JUDGED, "How far from the surface a Gaussian is of a layer."),
     Constant("beam_warp.materials.normals:FACE_SPREAD", BOTH, "Normals of one face, beside an edge [rad]."),
     Constant("beam_warp.materials.normals:FACE_PASSES", BOTH, "Rounds of averaging over a face."),
     Constant("beam_warp.materials.normals:LEAST_TOWARDS", JUDGED, "An own axis that faces as pixels see."),
