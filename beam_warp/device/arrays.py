@@ -18,8 +18,8 @@ from beam_warp.errors import DeviceError, InvalidArrayError
 wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # a library prints no banner
 
 KEPT_BYTES = 2**28
-"""Memory of a CUDA device that is kept for the next arrays rather than given back whenever the device is waited for:
-the driver takes a millisecond to find 100 MB again."""
+"""Memory of a CUDA device that is kept for the next arrays rather than given back whenever the device is waited for,
+since the driver takes long to find it again."""
 
 
 def resolve_device(device: str | None = None) -> Any:

@@ -38,7 +38,7 @@ TRIED = 40
 """Draws of the search on which a candidate is judged: its worst is then beyond 98 % of all, as a rule."""
 
 GPU_STEPS, CPU_STEPS = 2880, 600
-"""Steps of a refit that is not told how many: in three seconds on an H200, every view is seen twenty times."""
+"""Steps of a refit that is not told how many: on a GPU every one of the usual views is seen twenty times."""
 
 SAMPLE_FRAMES = 4
 """Frames, evenly over a sequence, that sensitivities are measured in."""
