@@ -10,6 +10,7 @@ import npm_packages
 import numpy as np
 import pytest
 from engines.probes import PROBES, REGIONS
+from engines.web import pages as web_pages
 from PIL import Image
 from support.drawn_ball import drawn_ball
 from support.player_pages import HEIGHT, WIDTH, as_rendered, picture, ready, said, settled, until
@@ -30,10 +31,6 @@ if CHROMIUM is None:
 
 pytestmark = pytest.mark.slow
 
-WEBGPU = (
-    *("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--use-angle=vulkan", "--use-vulkan=swiftshader"),
-    "--enable-features=Vulkan",
-)
 FRAMES = 14
 """One more segment than one."""
 
@@ -70,7 +67,7 @@ def written(take, light, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browsers():
-    """Starts browsers: one without WebGPU, or one without WebGL 2."""
+    """Starts browsers: one without WebGPU, or one with it."""
     with sync_api.sync_playwright() as playwright:
         yield lambda flags: playwright.chromium.launch(executable_path=CHROMIUM, args=list(flags))
 
@@ -109,7 +106,10 @@ def page(opened, written):
 
 @pytest.mark.parametrize("backend", ["webgl2", "webgpu"])
 def test_it_shows_what_the_renderer_shows(opened, written, light, browsers, browser, backend):
-    other = browser if backend == "webgl2" else browsers((*FLAGS, *WEBGPU))
+    other = browser
+    if backend == "webgpu":
+        other = browsers((*web_pages.FLAGS, *web_pages.BOTH_FLAGS))
+        web_pages.need_shown_webgpu(other)
     page = ready(opened(written, browser=other))
     assert page.evaluate("player.relight.backend") == backend
     expected, alpha = as_rendered(page, ball(0), EnvironmentMap.read(light))

@@ -6,7 +6,7 @@ from io import BytesIO
 
 import numpy as np
 import pytest
-from engines.web.pages import CANVAS_FLAGS, FLAGS, MODULE, camera_record, chromium, numbers, open_page
+from engines.web.pages import BACKENDS, MODULE, camera_record, chromium, need_shown_webgpu, numbers, open_page
 from PIL import Image
 from support.drawn_ball import drawn_ball, relightable
 from web.viewers import CHROMIUM
@@ -193,13 +193,12 @@ def test_a_canvas_shows_what_webgpu_and_webgl2_draw(browser, take):
         made.channel = "base_color";
         await made.render(camera);
         await new Promise(requestAnimationFrame); }}"""
-    launch = browser.browser_type.launch
-    canvases = launch(executable_path=CHROMIUM, args=[*FLAGS, *CANVAS_FLAGS])
-    for backend, opened in (("webgl2", browser), ("webgpu", canvases)):
-        page = open_page(opened, {"take.b4d": take})
+    need_shown_webgpu(browser)
+    for backend in BACKENDS:
+        page = open_page(browser, {"take.b4d": take})
         page.evaluate(script, backend)
         shown[backend] = picture_of(page)
-    canvases.close()
+        page.close()
     assert (shown["webgl2"][0, 0] == [255, 0, 0]).all()
     assert (np.abs(shown["webgl2"].astype(int) - shown["webgpu"]).max(axis=-1) <= 1).mean() > 0.999
     assert np.ptp(shown["webgl2"][..., 2]) > 64
