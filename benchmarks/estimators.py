@@ -26,6 +26,8 @@ from beam_warp.demo.figure import build_figure
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.incident import irradiance
 from beam_warp.world.environment import EnvironmentMap, texel_directions
+from beam_warp.world.harmonics import even_directions
+from beam_warp.world.quaternions import turns_from_z
 
 REFERENCE_RAYS = 16_384
 SEEDS = range(1, 5)
@@ -86,23 +88,12 @@ CURVES = (
 
 def discs(points: NDArray, normals: NDArray, spacing: float) -> dict[str, NDArray]:
     """One flat Gaussian a point, wide enough to close the surface."""
-    w = 1.0 + normals[:, 2]
-    turns = np.stack([-normals[:, 1], normals[:, 0], np.zeros_like(w), np.maximum(w, 1e-6)], axis=1)
-    turns[w < 1e-6] = (1.0, 0.0, 0.0, 0.0)
     return {
         "positions": points,
-        "orientations": turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        "orientations": turns_from_z(normals),
         "scales": np.tile([0.65 * spacing, 0.65 * spacing, 0.065 * spacing], (len(points), 1)),
         "opacities": np.full(len(points), 0.98),
     }
-
-
-def sphere_set(count: int) -> NDArray:
-    """Spherical Fibonacci set."""
-    i = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * i / count
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * i
-    return np.stack([np.sqrt(1.0 - z * z) * np.cos(phi), np.sqrt(1.0 - z * z) * np.sin(phi), z], axis=1)
 
 
 def make_figure(device: str | None, count: int) -> tuple[Scene, NDArray, NDArray]:
@@ -127,7 +118,7 @@ def make_ball(device: str | None, count: int) -> tuple[Scene, NDArray, NDArray]:
     grid = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
     y, z = (a.ravel() for a in np.meshgrid(side, np.arange(spacing / 2, 1.2, spacing), indexing="ij"))
     wall = np.stack([np.full(len(y), -1.0), y, z], axis=1)
-    ball = sphere_set(2500)
+    ball = even_directions(2500)
     parts = [
         discs(grid, np.tile([0.0, 0.0, 1.0], (len(grid), 1)), spacing),
         discs(wall, np.tile([1.0, 0.0, 0.0], (len(wall), 1)), spacing),

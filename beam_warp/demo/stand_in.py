@@ -14,7 +14,7 @@ from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb
 from beam_warp.trace.mesh_paths import TracedMesh, outgoing_radiance
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import sh_basis
+from beam_warp.world.harmonics import even_directions, sh_basis
 from beam_warp.world.mesh import MaterialMesh
 
 TANGENTIAL_DEVIATION = 0.7
@@ -116,13 +116,8 @@ def tangent_frames(
 
 def _seen_directions(normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the directions in which a dome of cameras sees each point, evenly over its visible side, ``(N, D, 3)``."""
-    index = np.arange(DIRECTION_COUNT) + 0.5
-    z = 1.0 - 0.85 * index / DIRECTION_COUNT
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
-    radius = np.sqrt(1.0 - z * z)
-    local = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1)
-    zero = np.zeros(len(normals))
-    return np.einsum("nij,dj->ndi", tangent_frames(normals, zero, np.zeros((len(normals), 2))), local)
+    frames = tangent_frames(normals, np.zeros(len(normals)), np.zeros((len(normals), 2)))
+    return np.einsum("nij,dj->ndi", frames, even_directions(DIRECTION_COUNT, last=0.15))
 
 
 def _fit_harmonics(colors: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:

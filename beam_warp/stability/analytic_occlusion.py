@@ -22,6 +22,8 @@ from beam_warp.trace.reference import visibility_reference
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import even_directions
+from beam_warp.world.quaternions import turns_from_z
 
 OVERLAP = 1.0
 """Tangential standard deviation of a tile in spacings: with alpha capped at 0.99 a layer of them passes about 1e-4."""
@@ -227,13 +229,11 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def tile(points: ArrayLike, normals: ArrayLike, spacing: float) -> GaussianCloud:
     """Return a cloud with one flat Gaussian at each point, facing along its normal."""
-    at, n = np.asarray(points, np.float64), np.asarray(normals, np.float64)
-    half = np.stack([-n[:, 1], n[:, 0], np.zeros(len(n)), 1.0 + n[:, 2]], axis=1)  # +z to n by the shortest way
-    half[n[:, 2] < -1.0 + 1e-9] = (1.0, 0.0, 0.0, 0.0)
+    at = np.asarray(points, np.float64)
     width = OVERLAP * spacing
     return GaussianCloud(
         positions=at.astype(np.float32),
-        orientations=half / np.linalg.norm(half, axis=1, keepdims=True),
+        orientations=turns_from_z(normals),
         scales=np.tile([width, width, width * FLATNESS], (len(at), 1)),
         opacities=np.ones(len(at), np.float32),
     )
@@ -257,11 +257,7 @@ def _disc(radius: float, spacing: float) -> NDArray[np.float64]:
 
 def _sphere(spacing: float) -> NDArray[np.float64]:
     """Return a spherical Fibonacci set ``(N, 3)`` on the unit sphere."""
-    count = round(4.0 * np.pi / spacing**2)
-    i = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * i / count
-    r, phi = np.sqrt(1.0 - z * z), np.pi * (1.0 + np.sqrt(5.0)) * i
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+    return even_directions(round(4.0 * np.pi / spacing**2))
 
 
 def _facing(points: NDArray[np.float64], direction: ArrayLike) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import turns_from_z
 from beam_warp.world.shot import ShotMesh
 
 SPREAD, THICKNESS = 0.6, 0.01
@@ -40,7 +41,7 @@ def discs_of(mesh: ShotMesh, count: int = 20_000) -> GaussianCloud:
     spread = np.sqrt(doubled)[rows] / parts[rows]
     arrays: dict[str, Any] = {
         "positions": (weights @ corners[rows])[:, 0],
-        "orientations": _turns(across[rows] / np.maximum(doubled[rows, None], 1e-300)),
+        "orientations": turns_from_z(across[rows] / np.maximum(doubled[rows, None], 1e-300)),
         "scales": spread[:, None] * np.array([SPREAD, SPREAD, THICKNESS]),
         "opacities": np.full(len(rows), OPACITY),
         "base_color": (weights @ surface.base_color[faces][rows])[:, 0],
@@ -58,10 +59,3 @@ def _middles(n: int) -> NDArray[np.float64]:
     turned = np.stack([i, j], axis=-1)[i + j < n - 1] + 2.0 / 3.0
     found = np.concatenate([upright, turned]) / n
     return np.column_stack([found, 1.0 - found.sum(axis=1)])
-
-
-def _turns(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quaternions xyzw that take z to unit normals."""
-    turns = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
-    turns[turns[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
-    return turns / np.linalg.norm(turns, axis=1, keepdims=True)

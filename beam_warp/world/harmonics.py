@@ -1,4 +1,4 @@
-"""Real spherical harmonics in the basis and sign convention of 3DGS: evaluate, and rotate.
+"""Real spherical harmonics in the basis and sign convention of 3DGS: evaluate, and rotate; directions to fit them in.
 
 3DGS stores, for band l, the orders m = -l … l in turn, with the signs of the reference implementation of
 Kerbl et al. 2023 (Condon–Shortley phase kept in the polynomials below). Plain NumPy float64 inside.
@@ -11,6 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 SH_C0 = 0.28209479177387814
 """Y_0 = 1 / (2 sqrt(pi)); a DC coefficient c shows the colour 0.5 + SH_C0 c."""
+
+
+def even_directions(count: int, first: float = 1.0, last: float = -1.0) -> NDArray[np.float64]:
+    """Return a spherical Fibonacci set, ``(count, 3)``: unit vectors, z in equal steps from one height to another."""
+    index = np.arange(count) + 0.5
+    z = first + (last - first) * index / count
+    phi, radius = np.pi * (1.0 + np.sqrt(5.0)) * index, np.sqrt(np.maximum(1.0 - z * z, 0.0))
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1)
 
 
 def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:
@@ -80,11 +88,7 @@ def sh_transform(linear: ArrayLike, degree: int) -> NDArray[np.float64]:
         ``((degree + 1)^2, (degree + 1)^2)`` float64, block diagonal by band.
     """
     matrix = np.asarray(linear, dtype=np.float64)
-    index = np.arange(64) + 0.5
-    z = 1.0 - 2.0 * index / 64.0
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * index  # a spherical Fibonacci set: even, so the system is well conditioned
-    radius = np.sqrt(1.0 - z * z)
-    directions = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1)
+    directions = even_directions(64)  # even, so the system is well conditioned
     count = (degree + 1) ** 2
     transform = np.zeros((count, count))
     here, there = sh_basis(directions, degree), sh_basis(directions @ matrix, degree)  # row d M = (M^T d)^T

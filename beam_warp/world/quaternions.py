@@ -1,4 +1,4 @@
-"""Rotations as unit quaternions xyzw: conversion from and to matrices, product, and interpolation."""
+"""Rotations as unit quaternions xyzw: from directions, from and to matrices, product, and interpolation."""
 
 from __future__ import annotations
 
@@ -37,6 +37,14 @@ def rotation_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:
     """Return the rotation matrices ``(..., 3, 3)`` of quaternions ``(..., 4)`` of any length but 0."""
     q = np.asarray(quaternions, np.float64)
     return matrix_of(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def turns_from_z(directions: ArrayLike) -> NDArray[np.float64]:
+    """Return the shortest rotations ``(N, 4)`` that carry +z to unit directions; straight down, half a turn about x."""
+    d = np.asarray(directions, np.float64)
+    turns = np.stack([-d[:, 1], d[:, 0], np.zeros(len(d)), 1.0 + d[:, 2]], axis=1)
+    turns[turns[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
+    return turns / np.linalg.norm(turns, axis=1, keepdims=True)
 
 
 def product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import even_directions
+from beam_warp.world.quaternions import turns_from_z
 
 TANGENTIAL = 0.65
 """Tangential standard deviation in spacings: neighbours overlap so far that the surface is closed."""
@@ -45,12 +47,7 @@ def rectangle(
 
 def sphere_zone(middle: NDArray[np.float64], radius: float, low: float, high: float, spacing: float) -> TiledSurface:
     """Return a spherical Fibonacci set between two heights, in radii over the middle; normals point outwards."""
-    count = max(1, round(2.0 * np.pi * radius**2 * (high - low) / spacing**2))
-    i = np.arange(count) + 0.5
-    z = low + (high - low) * i / count
-    angle = np.pi * (1.0 + np.sqrt(5.0)) * i
-    around = np.sqrt(np.maximum(1.0 - z * z, 0.0))
-    normals = np.stack([around * np.cos(angle), around * np.sin(angle), z], axis=1)
+    normals = even_directions(max(1, round(2.0 * np.pi * radius**2 * (high - low) / spacing**2)), low, high)
     return TiledSurface(middle + radius * normals, normals, spacing)
 
 
@@ -58,13 +55,9 @@ def tile(surfaces: tuple[TiledSurface, ...]) -> GaussianCloud:
     """Return a cloud with one flat Gaussian on every point, its shortest axis along the normal; it has the normals."""
     normals = np.concatenate([surface.normals for surface in surfaces])
     spacing = np.concatenate([np.full(len(surface.points), surface.spacing) for surface in surfaces])
-    # Shortest rotation that carries +z to the normal; straight down, half a turn about x
-    w = 1.0 + normals[:, 2]
-    turned = np.stack([-normals[:, 1], normals[:, 0], np.zeros_like(w), w], axis=1)
-    turned[w < 1e-9] = (1.0, 0.0, 0.0, 0.0)
     return GaussianCloud(
         positions=np.concatenate([surface.points for surface in surfaces]).astype(np.float32),
-        orientations=turned / np.linalg.norm(turned, axis=1, keepdims=True),
+        orientations=turns_from_z(normals),
         scales=(spacing[:, None] * TANGENTIAL * np.array([1.0, 1.0, FLATNESS])).astype(np.float32),
         opacities=np.full(len(normals), OPACITY),
         normals=normals.astype(np.float32),

@@ -2,12 +2,12 @@
 
 import numpy as np
 from scipy import ndimage
-from support.shapes import quaternions_from_normals
 
 from beam_warp.capture.capture import Capture
 from beam_warp.image.metrics import angles_between, block_means
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import turns_from_z
 
 SAMPLES = 200_000
 """Discs on the mesh, one standard deviation apart: 3 mm on a person, half a pixel of these captures."""
@@ -36,7 +36,7 @@ def surface_discs(vertices, faces, rng):
     spacing = np.sqrt(area.sum() / SAMPLES)
     return GaussianCloud(
         positions=np.einsum("ni,nij->nj", rng.dirichlet([1, 1, 1], SAMPLES), corners[face]),
-        orientations=quaternions_from_normals(normals),
+        orientations=turns_from_z(normals),
         scales=np.tile([spacing, spacing, 0.0], (SAMPLES, 1)),
         opacities=np.ones(SAMPLES),
         normals=normals,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from skimage.metrics import structural_similarity
-from support.shapes import colored, quaternions_from_normals
+from support.shapes import colored
 
 from beam_warp.errors import InvalidArrayError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
@@ -12,6 +12,7 @@ from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance, truth_frames
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.quaternions import turns_from_z
 
 DISCS = 20_000
 
@@ -24,7 +25,7 @@ def discs(tiny_capture):
     spacing = np.sqrt(mesh.area / DISCS)
     cloud = GaussianCloud(
         positions=points,
-        orientations=quaternions_from_normals(mesh.face_normals[faces]),
+        orientations=turns_from_z(mesh.face_normals[faces]),
         scales=np.tile([spacing, spacing, 0.05 * spacing], (DISCS, 1)),
         opacities=np.full(DISCS, 0.99),
     )

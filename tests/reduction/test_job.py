@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.shapes import sphere_points
 
 from beam_warp import converters
 from beam_warp.cli.main import main as beam
@@ -27,6 +28,7 @@ from beam_warp.reduction.sensitivity import LIGHTS as EACH
 from beam_warp.reduction.sensitivity import MATERIALS, material_rows
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.quaternions import turns_from_z
 
 RASTER = RasterOptions(antialiased=True)
 LIGHTS = [demo_environments()["studio"].resized(16, 32), demo_environments()["stage"].resized(16, 32)]
@@ -35,11 +37,8 @@ QUICK = ReduceOptions(gaussians=60, height=32, views=4, steps=6, pairs=6, device
 
 def ball(count: int = 300, frames: int = 1) -> GaussianSequence:
     """A ball of Gaussians in two colours, which turns."""
-    k = np.arange(count) + 0.5
-    z, around = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
-    flat, spacing = np.sqrt(1.0 - z * z), np.sqrt(4.0 * np.pi / count)
-    still = np.stack([flat * np.cos(around), flat * np.sin(around), z], axis=1)
-    half = np.stack([-still[:, 1], still[:, 0], np.zeros(count), 1.0 + z], axis=1)
+    still, spacing = sphere_points(count)
+    facing = Rotation.from_quat(turns_from_z(still))
     clouds = []
     for frame in range(frames):
         turn = Rotation.from_rotvec([0.0, 0.0, 0.3 * frame])
@@ -47,10 +46,10 @@ def ball(count: int = 300, frames: int = 1) -> GaussianSequence:
         clouds.append(
             GaussianCloud(
                 positions=normals + np.array([0.0, 0.0, 0.1 * frame]),
-                orientations=(turn * Rotation.from_quat(half)).as_quat(),
+                orientations=(turn * facing).as_quat(),
                 scales=np.tile([0.6 * spacing, 0.6 * spacing, 0.05 * spacing], (count, 1)),
                 opacities=np.full(count, 0.95),
-                base_color=np.where(z[:, None] > 0.2, [0.7, 0.2, 0.1], [0.1, 0.3, 0.6]),
+                base_color=np.where(still[:, 2:] > 0.2, [0.7, 0.2, 0.1], [0.1, 0.3, 0.6]),
                 roughness=np.full(count, 0.6),
                 ambient_occlusion=np.ones(count),
                 normals=normals,

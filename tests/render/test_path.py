@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from support.estimates import LARGEST_Z, require_zero_mean
 from support.flat_scenes import brdf_twin, mesh_of, nothing, plate
-from support.shapes import cloud_of, quaternions_from_normals, sphere_points, tiles
+from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError
 from beam_warp.light.ggx import specular_albedo
@@ -18,6 +18,7 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.lights import DirectionalLight, PointLight, SpotLight
 from beam_warp.world.mesh import MaterialMesh
+from beam_warp.world.quaternions import turns_from_z
 from beam_warp.world.shot import Shot, ShotMesh
 
 WHITE = EnvironmentMap.constant((1.0, 1.0, 1.0))
@@ -40,7 +41,7 @@ def relightable(base_color=0.5, roughness=0.5, **arrays):
 def disc(height=0.0, normal=(0.0, 0.0, 1.0), *, size=1.0, opacity=ALPHA_MAX, center=(0.0, 0.0), **material):
     """One large flat Gaussian: a plane, as far as a narrow view of its middle is concerned."""
     normal = np.asarray(normal, float)[None] / np.linalg.norm(normal)
-    place = {"positions": [[*center, height]], "orientations": quaternions_from_normals(normal), "normals": normal}
+    place = {"positions": [[*center, height]], "orientations": turns_from_z(normal), "normals": normal}
     return relightable(**place, scales=[[size, size, 1e-3 * size]], opacities=[opacity], **material)
 
 

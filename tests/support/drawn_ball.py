@@ -7,6 +7,8 @@ import numpy as np
 from beam_warp import converters
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.harmonics import even_directions
+from beam_warp.world.quaternions import turns_from_z
 
 
 def relightable(positions, **changes):
@@ -27,14 +29,10 @@ def relightable(positions, **changes):
 
 def drawn_ball(center=(0.0, 0.0, 0.0), color=(0.8, 0.4, 0.2), count=10_000):
     """Opaque flat discs on a ball of radius 0.5 m."""
-    index = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * index / count
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
-    normals = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1)
-    turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
+    normals = even_directions(count)
     return relightable(
         0.5 * normals + center,
-        orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        orientations=turns_from_z(normals),
         scales=np.tile([0.015, 0.015, 1e-4], (count, 1)),
         opacities=np.full(count, 0.99),
         radiance=np.zeros((count, 1, 3)),

@@ -9,6 +9,7 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.mesh.distances import SurfaceTree
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.quaternions import turns_from_z
 
 DISCS = 6_000
 OPENNESS = 0.8
@@ -28,13 +29,11 @@ def figure_asset(size=48, frame_count=2, metadata=None):
             faces, weights = tree.sample(DISCS, seed=3)
         normals = mesh.interpolate(mesh.normals, faces, weights)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        turn = np.concatenate([np.cross([0.0, 0.0, 1.0], normals), 1.0 + normals[:, 2:]], axis=1)
-        turn[turn[:, 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
         color = np.clip(mesh.interpolate(mesh.base_color, faces, weights), 0.0, 1.0)
         clouds.append(
             GaussianCloud(
                 positions=tree.at(faces, weights),
-                orientations=turn / np.linalg.norm(turn, axis=1, keepdims=True),
+                orientations=turns_from_z(normals),
                 scales=np.tile([0.010, 0.010, 1e-3], (DISCS, 1)),
                 opacities=np.full(DISCS, 0.99),
                 radiance=((color - 0.5) / SH_C0)[:, None, :],

@@ -1,11 +1,11 @@
 """Flat Gaussians and level squares of triangles with materials, and the BSDF in float64, for tests of renderers."""
 
 import numpy as np
-from support.shapes import quaternions_from_normals
 
 from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, schlick_weight, smith_lambda
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.mesh import MaterialMesh
+from beam_warp.world.quaternions import turns_from_z
 from beam_warp.world.shot import ShotMesh
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -18,7 +18,7 @@ def discs(positions, normals, radius, *, color=1.0, roughness=1.0, openness=1.0,
     n = np.broadcast_to(np.asarray(normals, float), (count, 3))
     return GaussianCloud(
         positions=positions,
-        orientations=quaternions_from_normals(n),
+        orientations=turns_from_z(n),
         scales=np.tile([radius, radius, 0.0], (count, 1)),
         opacities=np.full(count, opacity),
         base_color=np.broadcast_to(np.asarray(color, np.float32), (count, 3)),

@@ -2,13 +2,14 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from support.shapes import quaternions_from_normals, sphere_points
+from support.shapes import sphere_points
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.quaternions import turns_from_z
 
 RADIUS = 0.5
 
@@ -65,7 +66,7 @@ def ball_cloud(count=300, *, radius=RADIUS, painted=True):
     color = paint(normals) if painted else np.full((count, 3), 0.35)
     return GaussianCloud(
         positions=radius * normals,
-        orientations=quaternions_from_normals(normals),
+        orientations=turns_from_z(normals),
         scales=np.tile([0.7 * spacing, 0.7 * spacing, 0.15 * spacing], (count, 1)),
         opacities=np.full(count, 0.8),
         radiance=((color - 0.5) / SH_C0)[:, None, :],

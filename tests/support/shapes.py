@@ -4,15 +4,8 @@ import numpy as np
 
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import SH_C0
-
-
-def quaternions_from_normals(normals):
-    """Shortest rotations that carry +z to each normal, xyzw."""
-    w = 1.0 + normals[:, 2]
-    q = np.stack([-normals[:, 1], normals[:, 0], np.zeros_like(w), np.maximum(w, 1e-6)], axis=1)
-    q[w < 1e-6] = (1.0, 0.0, 0.0, 0.0)
-    return q / np.linalg.norm(q, axis=1, keepdims=True)
+from beam_warp.world.harmonics import SH_C0, even_directions
+from beam_warp.world.quaternions import turns_from_z
 
 
 def tiles(points, normals, spacing, *, flatness=0.1, opacity=0.95):
@@ -20,7 +13,7 @@ def tiles(points, normals, spacing, *, flatness=0.1, opacity=0.95):
     count = len(points)
     return {
         "positions": np.asarray(points),
-        "orientations": quaternions_from_normals(np.asarray(normals, dtype=float)),
+        "orientations": turns_from_z(normals),
         "scales": np.tile([0.65 * spacing, 0.65 * spacing, 0.65 * spacing * flatness], (count, 1)),
         "opacities": np.full(count, opacity),
     }
@@ -40,11 +33,7 @@ def colored(cloud, linear, color_space=LINEAR_REC709):
 
 def sphere_points(count):
     """Spherical Fibonacci set and its spacing on the unit sphere."""
-    i = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * i / count
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * i
-    r = np.sqrt(1.0 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1), np.sqrt(4.0 * np.pi / count)
+    return even_directions(count), np.sqrt(4.0 * np.pi / count)
 
 
 def disc_points(radius, spacing):

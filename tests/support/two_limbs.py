@@ -3,12 +3,12 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 from support.moving_ball import block_means, paint
-from support.shapes import quaternions_from_normals
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.quaternions import turns_from_z
 
 BODY = np.array([[0.0, 0.0, -0.3], [0.0, 0.0, 0.35]]), 0.18
 ARM = np.array([[0.12, 0.0, 0.33], [0.34, 0.0, -0.2]]), 0.07
@@ -65,7 +65,7 @@ def limb_cloud(spacing, degrees):
     count = len(points)
     return GaussianCloud(
         positions=points,
-        orientations=quaternions_from_normals(normals),
+        orientations=turns_from_z(normals),
         scales=np.tile([0.7 * spacing, 0.7 * spacing, 0.15 * spacing], (count, 1)),
         opacities=np.full(count, 0.8),
         radiance=((paint(own) - 0.5) / SH_C0)[:, None, :],
