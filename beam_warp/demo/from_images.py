@@ -17,11 +17,11 @@ from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.decomposition.job import OverviewOptions, RunOptions, RunResult, run
 from beam_warp.decomposition.options import ESTIMATE
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, require_free, write_demo_capture
-from beam_warp.demo.truth import DemoTruth, display_color, relit_views, score_views
+from beam_warp.demo.truth import DemoTruth, relit_views, score_views
 from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import code_digest
 from beam_warp.image.files import write_png
-from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.image.panels import Panel, display_color, lay_out, over_background
 from beam_warp.jobs.listeners import StageProgress
 from beam_warp.jobs.progress import StageTimer
 from beam_warp.jobs.report import write_json

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beam_warp.image.files import display_image
 from beam_warp.image.metrics import SOLID_ALPHA, Score, compare, least_squares_scale, mean_scores
-from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.image.panels import Panel, display_color, gray, lay_out, over_background
 from beam_warp.raster.gbuffer import GBuffer, rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.sheet import display_exposure
@@ -100,10 +100,6 @@ def score_views(truths: Sequence[DemoTruth], views: Sequence[Relit]) -> dict[str
 
 def comparison(truth: DemoTruth, view: Relit, lights: Mapping[str, EnvironmentMap]) -> NDArray[np.uint8]:
     """Draw ours above, truth below, for ambient occlusion, base colour and every light; 8-bit sRGB."""
-
-    def gray(values: NDArray[np.float32]) -> NDArray[np.floating]:
-        return np.repeat(np.clip(values, 0.0, 1.0)[..., None], 3, axis=-1)
-
     found, known = view.buffer.channels, truth.channels
     pairs = [
         ("ambient occlusion", gray(found["ambient_occlusion"]), gray(known.ambient_occlusion)),
@@ -117,9 +113,3 @@ def comparison(truth: DemoTruth, view: Relit, lights: Mapping[str, EnvironmentMa
     above: list[Panel] = [(f"{title}, ours", over_background(a, alphas[0])) for title, a, _ in pairs]
     below: list[Panel] = [(f"{title}, truth", over_background(b, alphas[1])) for title, _, b in pairs]
     return lay_out([*above, *below], len(pairs))
-
-
-def display_color(image: NDArray[np.floating], alpha: NDArray[np.floating], stops: float = 0.0) -> NDArray[np.floating]:
-    """Return premultiplied radiance as straight display colour in [0, 1]."""
-    straight = np.divide(image, alpha[..., None], out=np.zeros_like(image), where=alpha[..., None] > 0.0)
-    return display_image(straight, stops) / 255.0

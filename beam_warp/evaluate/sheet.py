@@ -13,7 +13,7 @@ from beam_warp.evaluate.scores import ImageScore
 from beam_warp.evaluate.views import ScoredView
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.metrics import bounding_box
-from beam_warp.image.panels import BACKGROUND, Panel, lay_out
+from beam_warp.image.panels import BACKGROUND, Panel, gray, lay_out
 
 AMPLIFICATION = 4
 """Factor by which differences are brightened: a quarter of the display's range becomes white."""
@@ -79,10 +79,7 @@ def _channels(view: ScoredView) -> Iterator[_Compared]:
         if known is None:
             continue
         ours = drawn.channels[name]
-        if ours.ndim == 3:
-            ours, known = _display(ours), _display(known)
-        else:
-            ours, known = (np.repeat(np.clip(image, 0.0, 1.0)[..., None], 3, axis=-1) for image in (ours, known))
+        ours, known = map(_display if ours.ndim == 3 else gray, (ours, known))
         over_black = ours * drawn.alpha[..., None], known * truth_alpha[..., None]
         yield _Compared(title, *over_black, scores.channels[name], drawn.alpha)
     for relighter, by_light in view.relit.items():

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
+from beam_warp.image.files import display_image
+
 BACKGROUND = 0.13
 """Display grey behind subjects, on which dark and white ones are both visible."""
 
@@ -17,6 +19,17 @@ TITLE_HEIGHT = 30
 TITLE_SIZE = 16
 Panel = tuple[str, NDArray[np.uint8]]
 """A title and 8-bit sRGB pixels ``(H, W, 3)``."""
+
+
+def gray(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return values ``(H, W)`` as display colour, 0 black and 1 white."""
+    return np.repeat(np.clip(values, 0.0, 1.0)[..., None], 3, axis=-1)
+
+
+def display_color(image: NDArray[np.floating], alpha: NDArray[np.floating], stops: float = 0.0) -> NDArray[np.floating]:
+    """Return premultiplied radiance as straight display colour in [0, 1]."""
+    straight = np.divide(image, alpha[..., None], out=np.zeros_like(image), where=alpha[..., None] > 0.0)
+    return display_image(straight, stops) / 255.0
 
 
 def over_background(display: NDArray[np.floating], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:

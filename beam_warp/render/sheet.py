@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import display_image
-from beam_warp.image.panels import MARGIN, TITLE_HEIGHT, Panel, lay_out, over_background
+from beam_warp.image.panels import MARGIN, TITLE_HEIGHT, Panel, display_color, gray, lay_out, over_background
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
@@ -79,9 +79,9 @@ def contact_sheet(
         captured = display_image(captured) / 255.0
     panels = [
         ("captured", over_background(np.clip(captured, 0.0, 1.0), alpha)),
-        ("ambient occlusion (white is open)", over_background(_gray(buffer.channels["ambient_occlusion"]), alpha)),
+        ("ambient occlusion (white is open)", over_background(gray(buffer.channels["ambient_occlusion"]), alpha)),
         ("base colour", over_background(display_image(buffer.channels["base_color"]) / 255.0, alpha)),
-        ("roughness (white is 1)", over_background(_gray(buffer.channels["roughness"]), alpha)),
+        ("roughness (white is 1)", over_background(gray(buffer.channels["roughness"]), alpha)),
         ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels["normals"] + 0.5, alpha)),
     ]
     prepared = [relighting.light for relighting in relightings if isinstance(relighting.light, PreparedEnvironment)]
@@ -91,14 +91,9 @@ def contact_sheet(
         image = renderer.draw(
             Shot(cloud=cloud, camera=camera, environment=light, environment_rotation=relighting.degrees)
         )
-        straight = np.divide(image.rgb, alpha, out=np.zeros_like(image.rgb), where=alpha > 0.0)
-        shown = display_image(straight, display_exposure(light)) / 255.0
+        shown = display_color(image.rgb, buffer.alpha, display_exposure(light))
         panels.append((relighting.title, over_background(shown, alpha)))
     return _grid(panels)
-
-
-def _gray(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.repeat(np.clip(values, 0.0, 1.0)[..., None], 3, axis=-1)
 
 
 def _grid(panels: Sequence[Panel]) -> NDArray[np.uint8]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from beam_warp._version import __version__
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError
-from beam_warp.image.color import linear_to_srgb
+from beam_warp.image.color import LUMINANCE, linear_to_srgb
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
@@ -127,7 +127,7 @@ def noise_of(image: RenderedImage, pixels: NDArray[np.int64] | None = None) -> f
     chosen = np.flatnonzero(image.alpha.reshape(-1) > 1.0 / 255.0) if pixels is None else pixels
     if not len(chosen):
         return 0.0
-    luminance = image.rgb.reshape(-1, 3)[chosen] @ np.array([0.2126, 0.7152, 0.0722])
+    luminance = image.rgb.reshape(-1, 3)[chosen] @ LUMINANCE
     error = image.layers["standard_error"].reshape(-1)[chosen] / (2.0 * np.sqrt(np.maximum(luminance, 1e-3)))
     return float(np.sqrt(np.mean(np.square(error, dtype=np.float64))))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -39,7 +41,7 @@ def rotation_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:
     return matrix_of(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
-def turns_from_z(directions: ArrayLike) -> NDArray[np.float64]:
+def turns_from_z(directions: ArrayLike) -> NDArray[Any]:
     """Return the shortest rotations ``(N, 4)`` that carry +z to unit directions; straight down, half a turn about x."""
     d = np.asarray(directions, np.float64)
     turns = np.stack([-d[:, 1], d[:, 0], np.zeros(len(d)), 1.0 + d[:, 2]], axis=1)
