@@ -14,7 +14,6 @@ need a machine that does nothing else. The lowest of repeats counts.
 from __future__ import annotations
 
 import copy
-import functools
 import io
 import json
 import lzma
@@ -33,7 +32,7 @@ import numpy as np
 import record
 import zstandard
 from delivery_take import FRAMES_PER_SECOND, take
-from parts import measure, say
+from parts import measure_all, say
 from PIL import Image
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
@@ -290,10 +289,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="beam_delivery_") as folder:
         frames, height = (4, 60) if arguments.quick else (24, 200)
         bench = Bench(settings, frames, height, arguments.repeats, Path(folder))
-        keep = functools.partial(record.write_result, arguments, resolve_device(None))
-        result = measure(PARTS, bench, only=arguments.parts, keep=keep)
-        keep(result)
-    return 1 if result["failed"] else 0
+        return measure_all(PARTS, bench, arguments, resolve_device(None), arguments.parts)
 
 
 if __name__ == "__main__":

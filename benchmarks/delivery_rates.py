@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import record
 from delivery_take import FRAMES_PER_SECOND, take
-from parts import measure, say
+from parts import measure_all, say
 from walking_take import FRAMES_PER_SECOND as WALKED_PER_SECOND
 from walking_take import SkinnedModel, walk
 
@@ -190,11 +190,8 @@ def main() -> int:
     parser.add_argument("--made", type=Path, metavar="FOLDER", help="where walker.usdc is")
     arguments = parser.parse_args()
     bench = _bench(arguments)
-    keep = functools.partial(record.write_result, arguments, resolve_device(None))
     without = ("figure",) if arguments.made is None else ()
-    result = measure(PARTS, bench, only=arguments.parts or without, keep=keep)
-    keep(result)
-    return 1 if result["failed"] else 0
+    return measure_all(PARTS, bench, arguments, resolve_device(None), arguments.parts or without)
 
 
 def _bench(arguments: argparse.Namespace) -> Bench:

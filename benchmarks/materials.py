@@ -23,7 +23,6 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ from materials_cost import measure_cost
 from materials_evaluation import measure_evaluation, measure_roughness, subject_of
 from materials_perfect import measure_perfect
 from materials_truth import TruthViews, row_of
-from parts import Row, measure, say
+from parts import Row, measure_all, say
 
 from beam_warp.capture.capture import Capture
 from beam_warp.device.arrays import resolve_device
@@ -127,9 +126,7 @@ def main() -> int:
                 folder=Path(folder),
             )
         bench = replace(bench, keep=arguments.keep, pictures=arguments.pictures)
-        keep = partial(record.write_result, arguments, device)
-        result = measure(PARTS, bench, only=arguments.parts, keep=keep)
-    return 1 if result["failed"] else 0
+        return measure_all(PARTS, bench, arguments, device, arguments.parts)
 
 
 if __name__ == "__main__":

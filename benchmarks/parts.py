@@ -6,7 +6,10 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
+
+import record
 
 Row = dict[str, Any]
 
@@ -52,3 +55,14 @@ def measure(
             keep(result)
         say(f"{name}: {time.perf_counter() - started:.1f} s")
     return result
+
+
+def measure_all(
+    parts: Mapping[str, Callable[[Any], Iterator[Any]]],
+    bench: Any,
+    arguments: Any,
+    device: Any,
+    only: Sequence[str] = (),
+) -> int:
+    """Run parts as `measure` does, write what they found as the program's result, and return its exit status."""
+    return 1 if measure(parts, bench, only=only, keep=partial(record.write_result, arguments, device))["failed"] else 0

@@ -25,7 +25,7 @@ import record
 from gsplat_peer import GsplatPeer, GsplatUnavailableError, kernel_seconds
 from gsplat_peer import Images as PeerImages
 from numpy.typing import NDArray
-from parts import measure, once, say
+from parts import measure_all, once, say
 from raster_contenders import Clocked, Drawing, Measured, Seen, captured, digits, measure_in_turn, random_adjoints
 from raster_scenes import RasterScene, cube, figure, growth
 from raster_stages import measure_stages
@@ -505,8 +505,7 @@ def main() -> int:
     known = sections(effort, device)
     if unknown := set(arguments.only) - set(known):
         parser.error(f"--only must name sections of {', '.join(known)}, got {unknown}")
-    result = measure(known, device, only=arguments.only, keep=partial(record.write_result, arguments, device))
-    return 1 if result["failed"] else 0
+    return measure_all(known, device, arguments, device, arguments.only)
 
 
 if __name__ == "__main__":

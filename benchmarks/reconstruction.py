@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 import record
 from device_memory import peak_memory
-from parts import measure, say
+from parts import measure_all, say
 from reconstruction_captures import write_large_capture
 from reconstruction_contenders import Contender, ModelledFrame, follow, of_options, write_sequence
 
@@ -496,8 +496,7 @@ def main() -> int:
             device,
             arguments.keep,
         )
-        result = measure(SECTIONS, bench, only=arguments.only, keep=partial(record.write_result, arguments, device))
-    return 1 if result["failed"] else 0
+        return measure_all(SECTIONS, bench, arguments, device, arguments.only)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ images, stand for base colours. What splat-transform makes is kept beside the as
 
 from __future__ import annotations
 
-import functools
 import os
 import subprocess
 import sys
@@ -40,7 +39,7 @@ import record
 import warp as wp
 from delivery_take import take
 from numpy.typing import NDArray
-from parts import measure, say
+from parts import measure_all, say
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -316,10 +315,7 @@ def main() -> int:
     options = ReduceOptions(gaussians=1, height=height, views=views, steps=steps, device=device)
     shares = (0.2,) if arguments.quick else (0.2, 0.1)
     bench = Bench(count, shares, tests, options, tuple(arguments.assets), arguments.made, device)
-    keep = functools.partial(record.write_result, arguments, device)
-    result = measure(PARTS, bench, only=arguments.parts, keep=keep)
-    keep(result)
-    return 1 if result["failed"] else 0
+    return measure_all(PARTS, bench, arguments, device, arguments.parts)
 
 
 if __name__ == "__main__":

@@ -18,13 +18,12 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import record
 from materials_bench import quick_capture
-from parts import Row, measure
+from parts import Row, measure_all
 from relight_accuracy import measure_accuracy, measure_shadows
 from relight_cost import measure_deferred, measure_moving, measure_path
 from relight_energy import measure_consistent, measure_furnace
@@ -81,8 +80,6 @@ def main() -> int:
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="images of the captures, as relight.npz")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    keep = partial(record.write_result, arguments, device)
-
     with tempfile.TemporaryDirectory() as folder:
         if arguments.quick:
             bench = quick_bench(Path(folder), device)
@@ -94,8 +91,7 @@ def main() -> int:
             bench = Bench(captures, {}, read_sky(arguments.data), effort, device, None)
         assets = find_assets(arguments.assets, list(bench.captures))
         bench = replace(bench, assets=assets, pictures=arguments.pictures)
-        result = measure(PARTS, bench, only=arguments.parts, keep=keep)
-    return 1 if result["failed"] else 0
+        return measure_all(PARTS, bench, arguments, device, arguments.parts)
 
 
 if __name__ == "__main__":

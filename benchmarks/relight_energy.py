@@ -20,10 +20,10 @@ from relight_scenes import LAMPS, Bench, ground
 
 from beam_warp.render.deferred import DeferredOptions, DeferredRenderer
 from beam_warp.render.path import PathOptions, PathRenderer
+from beam_warp.stability.relighting_cases.scenes import relightable, sheet
 from beam_warp.study.true_surface import gaussians_on_mesh
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.shot import Renderer, Shot
 
 ROUGHNESS = (0.03, 0.1, 0.3, 0.6, 1.0)
@@ -79,15 +79,7 @@ def measure_furnace(bench: Bench) -> Iterator[Row]:
 
 def white_plane(size: int) -> Shot:
     """Return one Gaussian so large that a narrow view of its middle is a plane."""
-    cloud = white(
-        GaussianCloud(
-            positions=np.zeros((1, 3)),
-            orientations=np.array([[0.0, 0.0, 0.0, 1.0]]),
-            scales=np.array([[1.0, 1.0, 1e-3]]),
-            opacities=np.array([0.99]),
-            normals=np.array([[0.0, 0.0, 1.0]]),
-        )
-    )
+    cloud = relightable(sheet((0.0, 0.0, 0.0), 1.0, 0.99))
     camera = Camera.look_at((1.0, 0.0, 1.5), (0.0, 0.0, 0.0), width=size, height=size, vertical_fov=2.0)
     return Shot(cloud=cloud, camera=camera, environment=WHITE)
 
@@ -95,20 +87,10 @@ def white_plane(size: int) -> Shot:
 def white_ball(bench: Bench) -> Shot:
     """Return a ball of radius 1 of many Gaussians."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
-    cloud = white(gaussians_on_mesh(sphere.vertices, sphere.faces, bench.effort.furnace_gaussians))
+    cloud = relightable(gaussians_on_mesh(sphere.vertices, sphere.faces, bench.effort.furnace_gaussians))
     size = bench.effort.furnace_size
     camera = Camera.look_at((0.0, -4.0, 0.5), (0.0, 0.0, 0.0), width=size, height=size, vertical_fov=32.0)
     return Shot(cloud=cloud, camera=camera, environment=WHITE)
-
-
-def white(cloud: GaussianCloud) -> GaussianCloud:
-    """Return Gaussians that absorb nothing."""
-    count = len(cloud)
-    return cloud.with_arrays(
-        base_color=np.ones((count, 3), np.float32),
-        roughness=np.ones(count, np.float32),
-        ambient_occlusion=np.ones(count, np.float32),
-    )
 
 
 def measure_consistent(bench: Bench) -> Iterator[Row]:

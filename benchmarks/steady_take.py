@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import record
-from parts import measure, say
+from parts import measure_all, say
 from reconstruction_captures import PUT_DOWN, write_walking_capture
 from walking_take import SkinnedModel
 
@@ -176,9 +176,7 @@ def main() -> int:
         place = arguments.keep or Path(folder)
         make = quick if arguments.quick else Bench
         bench = make(model, light, arguments.device, place)
-        keep = partial(record.write_result, arguments, resolve_device(arguments.device))
-        result = measure(PARTS, bench, only=arguments.parts, keep=keep)
-    return 1 if result["failed"] else 0
+        return measure_all(PARTS, bench, arguments, resolve_device(arguments.device), arguments.parts)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy as np
 import record
 import warp as wp
 from numpy.typing import NDArray
-from parts import measure, once
+from parts import measure_all, once
 from timing import Task, Times, spread, take_turns
 from tracing_baselines import (
     BUILD_QUALITIES,
@@ -514,8 +514,7 @@ def main() -> int:
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     effort = QUICK if arguments.quick else ON_CUDA if device.is_cuda else ON_CPU
-    result = measure(sections(effort), device, keep=partial(record.write_result, arguments, device))
-    return 1 if result["failed"] else 0
+    return measure_all(sections(effort), device, arguments, device)
 
 
 if __name__ == "__main__":

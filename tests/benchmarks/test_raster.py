@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import raster as benchmark
 from gsplat_peer import Images, arguments
+from parts import measure
 from raster_contenders import Drawing, Seen, random_adjoints
 from raster_images import draw, grazing_scene, image_panels, write_sheet
 from raster_plot import draw_growth, draw_stages
@@ -158,7 +159,7 @@ def test_everything_is_measured(device, tmp_path):
     target = resolve_device(device)
     states = []
     sections = benchmark.sections(TINY, target)
-    result = benchmark.measure(sections, target, keep=lambda state: states.append(json.dumps(state)))
+    result = measure(sections, target, keep=lambda state: states.append(json.dumps(state)))
     assert result["failed"] == []
     result = json.loads(states[-1])
     assert len(states) == len(sections)

@@ -8,6 +8,7 @@ import pytest
 import reconstruction as benchmark
 import tables_reconstruction as tables
 import trimesh
+from parts import measure
 from reconstruction_captures import (
     CASE,
     PUT_DOWN,
@@ -150,7 +151,7 @@ class TestSections:
 
     def test_all_sections_run_and_tables_show_them(self, bench, tmp_path):
         kept = []
-        result = benchmark.measure(
+        result = measure(
             benchmark.SECTIONS, bench, keep=lambda state: kept.append(json.dumps(state, default=np.ndarray.tolist))
         )
         assert result["failed"] == []
@@ -180,7 +181,7 @@ class TestSections:
         assert (tmp_path / "chart.png").stat().st_size > 10_000
 
     def test_kept_sequences_say_how_they_are_drawn_and_what_they_show(self, bench):
-        assert benchmark.measure(benchmark.SECTIONS, bench, only=("captures",))["failed"] == []
+        assert measure(benchmark.SECTIONS, bench, only=("captures",))["failed"] == []
         sequence = converters.read(bench.keep / "robot" / "gaussians.usda")
         assert sequence.metadata["capture_frames"] == "0 1"
         assert benchmark.RasterOptions.from_metadata(sequence.metadata) == FIT_RASTER

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tracing as benchmark
 import warp as wp
+from parts import measure
 from support.shapes import random_cloud, random_rays
 from timing import Times, launch_threads
 from tracing_baselines import EmbreeScene, EmbreeUnavailableError, PlainBvh, pack_gaussians
@@ -233,7 +234,7 @@ def test_everything_is_measured(device, tmp_path):
     written = []
     sections = benchmark.sections(effort)
     keep = lambda found: written.append(json.dumps(found))  # noqa: E731
-    result = benchmark.measure(sections, resolve_device(device), keep=keep)
+    result = measure(sections, resolve_device(device), keep=keep)
     assert len(written) == len(sections)
     assert json.loads(written[-1]) == json.loads(json.dumps(result))
     assert result["failed"] == []
