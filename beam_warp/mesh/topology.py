@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def mesh_report(mesh: trimesh.Trimesh) -> MeshReport:
     distinct, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
     open_edges = distinct[uses == 1]
     ends = np.stack([open_edges // max(count, 1), open_edges % max(count, 1)], axis=1)
-    rims = np.bincount(_labels(ends, count)[ends[:, 0]]) if len(ends) else ends
+    rims = np.bincount(connected_component_labels(ends, count)[ends[:, 0]]) if len(ends) else ends
     return MeshReport(
         count,
         len(faces),
@@ -67,10 +66,4 @@ def mesh_report(mesh: trimesh.Trimesh) -> MeshReport:
 def face_parts(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
     """Return the number of the connected part that each face belongs to, ``(F,)``; parts share no vertex."""
     index = np.asarray(faces).reshape(-1, 3)
-    return _labels(np.concatenate([index[:, :2], index[:, 1:]]), vertex_count)[index[:, 0]]
-
-
-def _labels(edges: NDArray[Any], vertex_count: int) -> NDArray[np.int64]:
-    """Return the connected component of every vertex."""
-    links = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
-    return connected_components(links, directed=False)[1].astype(np.int64)
+    return connected_component_labels(np.concatenate([index[:, :2], index[:, 1:]]), vertex_count)[index[:, 0]]

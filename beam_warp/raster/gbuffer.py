@@ -132,12 +132,12 @@ def rasterize_values(
 ) -> ValueImages:
     """Draw any per-Gaussian values: the linear map from values to pixels that `rasterize` rests on.
 
+    Options and device are those of `rasterize`.
+
     Args:
         cloud: Gaussians in the internal world (axes ``rfu``).
         camera: The camera.
         values: ``(N, K)`` finite float32, K at least 0.
-        options: See `rasterize`.
-        device: See `rasterize`.
 
     Raises:
         InvalidOptionError: The cloud is in other axes.
@@ -190,18 +190,13 @@ def rasterize_backward(
 
     The cloud is drawn again: a loop that draws and differentiates holds a `Rasterizer` instead. Discrete decisions
     are held still: which splats count, their order, the cap of alpha, the pick of the median. The bits depend on the
-    device alone.
+    device alone. All other arguments are those of `rasterize`.
 
     Args:
-        cloud: See `rasterize`.
-        cameras: See `rasterize`.
         adjoints: Derivatives of the loss to the images, by name: of an attribute of `GBuffer` (``alpha``, ``depth``,
             ``median_depth``) or of a channel. Images left out have derivatives of 0. One mapping for a camera, as
             many as cameras for a sequence.
-        channels: See `rasterize`.
         cameras_too: Whether derivatives to the cameras are wanted as well.
-        options: See `rasterize`.
-        device: See `rasterize`.
 
     Raises:
         InvalidOptionError: A name is neither an image nor a channel drawn, or their number is not that of the cameras;

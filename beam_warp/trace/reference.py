@@ -99,16 +99,10 @@ def visibility_enclosure(
 ) -> Enclosure:
     """Return the exact transmittance of each ray and the interval that float32 must stay in.
 
-    Where an interval straddles a decision (in front or not, above the cut or not), both outcomes are allowed.
+    Where an interval straddles a decision (in front or not, above the cut or not), both outcomes are allowed. All
+    other arguments are those of `visibility_reference`.
 
     Args:
-        cloud: As `visibility_reference`.
-        origins: As `visibility_reference`.
-        directions: As `visibility_reference`.
-        t_max: As `visibility_reference`.
-        front: As `visibility_reference`.
-        cull: As `visibility_reference`.
-        response_degree: As `visibility_reference`.
         stop: Transmittance below which the tracer may stop.
         middle: Point that the tracer's coordinates are relative to [m]: its distances are what is rounded.
         roundoff: Relative error of one operation; 0 encloses nothing but the exact value.
