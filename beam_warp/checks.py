@@ -70,14 +70,14 @@ def require_range(name: str, array: NDArray[Any], low: float, high: float, remed
         raise InvalidArrayError(f"{name} must lie in [{low:g}, {high:g}], got {worst:g} at {where}. {remedy}")
 
 
-def require_unit(name: str, array: NDArray[Any], remedy: str = "Normalise it.") -> None:
+def require_unit(name: str, array: NDArray[Any]) -> None:
     """Refuse rows whose length is not 1 within ``UNIT_TOLERANCE``."""
     length = np.sqrt(np.einsum("ij,ij->i", array, array))
     unit = np.abs(length - 1.0) <= UNIT_TOLERANCE
     if not unit.all():
         row = int(np.flatnonzero(~unit)[0])
         where = rows_at(~unit)
-        raise InvalidArrayError(f"{name} must have unit length, got |v| = {length[row]:.4g} at {where}. {remedy}")
+        raise InvalidArrayError(f"{name} must have unit length, got |v| = {length[row]:.4g} at {where}. Normalise it.")
 
 
 def require_same_length(name: str, array: NDArray[Any], other_name: str, count: int) -> None:

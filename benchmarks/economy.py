@@ -21,13 +21,14 @@ from typing import Any
 
 import numpy as np
 import record
-from materials_truth import Materials, PerfectFrame, TruthViews, light_reference, rms
+from materials_truth import Materials, PerfectFrame, TruthViews, light_reference
 from numpy.typing import NDArray
 from timing import Task, spread, take_turns
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import MaterialMeasurement, measure_materials
@@ -107,7 +108,7 @@ def summary(errors: NDArray[np.floating[Any]]) -> dict[str, float]:
     """Return what errors of independent points come to."""
     each = errors.reshape(len(errors), -1).mean(axis=1, dtype=np.float64)
     return {
-        "rmse": rms(errors),
+        "rmse": root_mean_square(errors),
         "largest_hundredth": float(np.percentile(np.abs(errors), 99)),
         "mean": float(each.mean()),
         "mean_in_standard_errors": float(each.mean() / (each.std(ddof=1) / np.sqrt(len(each)))),
@@ -116,7 +117,7 @@ def summary(errors: NDArray[np.floating[Any]]) -> dict[str, float]:
 
 def equal_rays(error: float, errors: Errors) -> float:
     """Return how many rays for each have an error, between those that were measured, on logarithmic axes."""
-    counts, fixed = np.log(list(errors)), np.log([rms(found) for found in errors.values()])
+    counts, fixed = np.log(list(errors)), np.log([root_mean_square(found) for found in errors.values()])
     return float(np.exp(np.interp(np.log(error), fixed[::-1], counts[::-1])))
 
 

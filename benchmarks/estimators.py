@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from beam_warp import GaussianCloud, Scene, ambient_occlusion, visibility
 from beam_warp.demo.figure import build_figure
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.incident import irradiance
 from beam_warp.world.environment import EnvironmentMap, texel_directions
@@ -173,15 +174,11 @@ def mean_in_standard_errors(errors: NDArray) -> float:
     return float(by_point.mean() / (by_point.std(ddof=1) / math.sqrt(len(by_point))))
 
 
-def rms(errors: NDArray) -> float:
-    return float(np.sqrt((errors.astype(np.float64) ** 2).mean()))
-
-
 def measure_occlusion(scene: Scene, points: NDArray, normals: NDArray, curve_counts: Sequence[int]) -> dict:
     truth = ambient_occlusion(scene, points, normals, sample_count=REFERENCE_RAYS, seed=99)
 
     def error(sampler: str, count: int) -> float:
-        return rms(
+        return root_mean_square(
             np.stack(
                 [
                     ambient_occlusion(scene, points, normals, sample_count=count, sampler=sampler, seed=s).visibility
@@ -207,7 +204,7 @@ def measure_occlusion(scene: Scene, points: NDArray, normals: NDArray, curve_cou
     curves = {sampler: [error(sampler, count) for count in curve_counts] for sampler in ("iid", "stratified", "owen")}
     return {
         "mean": float(truth.visibility.mean()),
-        "reference_standard_error": rms(truth.standard_error),
+        "reference_standard_error": root_mean_square(truth.standard_error),
         "rows": rows,
         "curves": curves,
     }
@@ -230,21 +227,21 @@ def measure_sky(
         rows.append(
             {
                 "name": row.name,
-                "relative_rmse": rms(relative_errors(found, truth.value)),
-                "rmse_over_mean": rms(found - truth.value) / float(truth.value.mean()),
+                "relative_rmse": root_mean_square(relative_errors(found, truth.value)),
+                "rmse_over_mean": root_mean_square(found - truth.value) / float(truth.value.mean()),
                 "bias_in_standard_errors": mean_in_standard_errors(relative_errors(found, truth.value)),
             }
         )
     curves = {
         f"{density}{' ratio' if ratio else ''} {sampler}": [
-            rms(relative_errors(estimates(density, ratio, sampler, count, range(1, 3)), truth.value))
+            root_mean_square(relative_errors(estimates(density, ratio, sampler, count, range(1, 3)), truth.value))
             for count in curve_counts
         ]
         for density, ratio, sampler in CURVES
     }
     return {
         "peak_over_mean": float(f"{sky.radiance.max() / sky.radiance.mean():.4g}"),
-        "reference_relative_standard_error": rms(truth.standard_error / floor),
+        "reference_relative_standard_error": root_mean_square(truth.standard_error / floor),
         "rows": rows,
         "curves": curves,
     }

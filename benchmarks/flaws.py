@@ -52,6 +52,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import BeamError
 from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.job import reconstruct
@@ -373,8 +374,8 @@ def shares(errors: NDArray[Any], stated: NDArray[Any]) -> Row:
         "median_z": float(np.median(z)),
         "within_1": float((z <= 1.0).mean()),
         "within_2": float((z <= 2.0).mean()),
-        "root_mean_square": float(np.sqrt(np.square(errors, dtype=np.float64).mean())),
-        "stated": float(np.sqrt(np.square(stated, dtype=np.float64).mean())),
+        "root_mean_square": root_mean_square(errors),
+        "stated": root_mean_square(stated),
     }
 
 

@@ -15,7 +15,7 @@ from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.capture.views import CapturedView
 from beam_warp.evaluate.relighters import Relighter
 from beam_warp.image.files import read_image
-from beam_warp.image.metrics import SOLID_ALPHA, Score, block_means, compare, mean_scores
+from beam_warp.image.metrics import SOLID_ALPHA, Score, block_means, compare, mean_scores, root_mean_square
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.normals import SurfacePoints
@@ -254,16 +254,11 @@ def light_errors(scene: Scene, reference: LightReference, light: PreparedEnviron
     mean = reference.value.mean()
     floor = np.maximum(reference.value, 0.05 * mean)
     return {
-        "relative_rmse": rms(difference / floor),
-        "rmse_over_mean": rms(difference) / mean,
+        "relative_rmse": root_mean_square(difference / floor),
+        "rmse_over_mean": root_mean_square(difference) / mean,
         "relative_bias": float((difference / floor).mean()),
-        "reference_relative_standard_error": rms(reference.standard_error / floor),
+        "reference_relative_standard_error": root_mean_square(reference.standard_error / floor),
     }
-
-
-def rms(array: NDArray[np.floating[Any]]) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.square(array, dtype=np.float64).mean()))
 
 
 def row_of(scores: Mapping[str, Any]) -> str:

@@ -26,8 +26,6 @@ FIGURE_SHARE = 0.26
 """Share of an image that a figure covers."""
 CUBE_DISTANCE = 1.2
 """Distance of the camera from the middle of a cube of side 1 [m]: its front then fills an image of up to 16 to 9."""
-VALUE_COUNT = 11
-"""Channels of `RasterScene.values`."""
 
 
 class RasterScene(NamedTuple):

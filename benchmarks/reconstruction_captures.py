@@ -17,7 +17,6 @@ from walking_take import FRAMES_PER_SECOND, START, SkinnedModel
 
 from beam_warp.capture.capture import Capture
 from beam_warp.demo.capture import DomeCamera, dome_cameras, write_capture
-from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.mesh import MaterialMesh, vertex_normals
@@ -120,7 +119,6 @@ def write_large_capture(
     samples: int = 16,
     subdivisions: int = 2,
     device: str | None = None,
-    progress: StageProgress = no_progress,
 ) -> Capture:
     """Path trace a known surface for a dome of cameras and write it as a capture; frames are numbered from 0."""
     meshes, surfaces = textured_meshes(source, frames, subdivisions)
@@ -130,9 +128,7 @@ def write_large_capture(
     light = (
         EnvironmentMap.read(source.environment_path) if source.environment_path else EnvironmentMap.constant([1] * 3)
     )
-    return write_capture(
-        folder, meshes, cameras, light, surfaces=surfaces, samples=samples, device=device, progress=progress
-    )
+    return write_capture(folder, meshes, cameras, light, surfaces=surfaces, samples=samples, device=device)
 
 
 def write_walking_capture(
@@ -182,7 +178,7 @@ def write_walking_capture(
         looks = texture(corners)
         upright = vertex_normals(corners, sides)
         meshes = [
-            joined(mesh, _mesh(corners + place, sides, upright, *looks))
+            mesh.beside(_mesh(corners + place, sides, upright, *looks))
             for mesh, place in zip(meshes, places, strict=True)
         ]
     cameras = dome_cameras([mesh.vertices for mesh in meshes], camera_count, test_camera_count, size, size)
@@ -215,15 +211,6 @@ def box(sides: tuple[float, float, float]) -> tuple[FloatArray, NDArray[np.int64
                 corners.append(0.5 * corner * sides)
             faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
     return np.stack(corners), np.array(faces)
-
-
-def joined(one: MaterialMesh, other: MaterialMesh) -> MaterialMesh:
-    """Return two meshes as one."""
-    arrays = {
-        name: np.concatenate([getattr(one, name), getattr(other, name)])
-        for name in ("vertices", "normals", "base_color", "roughness")
-    }
-    return MaterialMesh(faces=np.concatenate([one.faces, other.faces + len(one.vertices)]), **arrays)
 
 
 def _mesh(

@@ -18,7 +18,7 @@ from beam_warp.checks import require_count
 from beam_warp.evaluate.compared import ComparedAsset
 from beam_warp.evaluate.drawn import SAMPLES, DrawnMaterials, draw_materials, true_channel
 from beam_warp.image.color import linear_to_srgb
-from beam_warp.jobs.listeners import CountProgress
+from beam_warp.jobs.listeners import CountProgress, no_progress
 from beam_warp.mesh.distances import SurfaceTree
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.scores import read_truth_mesh
@@ -212,7 +212,7 @@ def surface_scores(
     samples: int = SAMPLES,
     point_count: int = POINT_COUNT,
     device: str | None = None,
-    progress: CountProgress | None = None,
+    progress: CountProgress = no_progress,
 ) -> dict[str, SurfaceScores | str]:
     """Follow points of the true surface through the test views: by channel of `RUNNING` its scores, or why it has none.
 
@@ -257,8 +257,7 @@ def surface_scores(
                 cloud, camera, channels=tuple(RUNNING), raster=raster, samples=samples, device=device
             )
             followed.add(frame, name, camera, drawn, record)
-        if progress is not None:
-            progress(done, len(frames))
+        progress(done, len(frames))
     assert followed is not None
     too_few = {"base_color": "two frames", "ambient_occlusion": "three frames that are evenly apart"}
     return {

@@ -37,6 +37,11 @@ class Score:
     solid_psnr: float
 
 
+def root_mean_square(values: ArrayLike) -> float:
+    """Return the root mean square of numbers of any shape, summed in float64."""
+    return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
+
+
 def psnr(image: ArrayLike, truth: ArrayLike, mask: NDArray[np.bool_] | None = None) -> float:
     """Return the peak signal-to-noise ratio for a peak of 1 [dB], over all pixels or those of a mask ``(H, W)``.
 

@@ -20,6 +20,7 @@ from beam_warp._version import __version__
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LUMINANCE, linear_to_srgb
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.deferred import DeferredRenderer
@@ -90,9 +91,7 @@ class TruePixels:
         return Interval(*(float(np.sqrt(max(value**2 - self.noise**2, 0.0))) for value in raw))
 
 
-def covered_pixels(
-    shot: Shot, raster: RasterOptions, device: Any, *, seed: int = 0, most: int | None = None
-) -> tuple[NDArray[np.int64], int]:
+def covered_pixels(shot: Shot, raster: RasterOptions, device: Any, *, seed: int = 0) -> tuple[NDArray[np.int64], int]:
     """Return the numbers of pixels that the subject covers, some of them at random, and how many there are.
 
     Raises:
@@ -102,7 +101,7 @@ def covered_pixels(
     covered = np.flatnonzero(image.alpha.reshape(-1) > 1.0 / 255.0)
     if not len(covered):
         raise InvalidArrayError("image must show the subject for its error to be measured, got none of it. Look at it.")
-    count = min(len(covered), TRUE_PIXELS[resolve_device(device).is_cuda] if most is None else most)
+    count = min(len(covered), TRUE_PIXELS[resolve_device(device).is_cuda])
     return np.sort(np.random.default_rng(seed).choice(covered, count, replace=False)), len(covered)
 
 
@@ -129,7 +128,7 @@ def noise_of(image: RenderedImage, pixels: NDArray[np.int64] | None = None) -> f
         return 0.0
     luminance = image.rgb.reshape(-1, 3)[chosen] @ LUMINANCE
     error = image.layers["standard_error"].reshape(-1)[chosen] / (2.0 * np.sqrt(np.maximum(luminance, 1e-3)))
-    return float(np.sqrt(np.mean(np.square(error, dtype=np.float64))))
+    return root_mean_square(error)
 
 
 def deferred_frame(

@@ -23,7 +23,7 @@ from beam_warp.checks import require_number
 from beam_warp.converters.staging import require_writable
 from beam_warp.errors import AssetFormatError, InvalidOptionError, MissingFileError, OutputError
 from beam_warp.image.files import replacing
-from beam_warp.jobs.listeners import StageProgress
+from beam_warp.jobs.listeners import StageProgress, no_progress
 
 Level = str | int | float
 
@@ -256,7 +256,7 @@ def pareto_frontier(costs: ArrayLike, errors: ArrayLike, tolerance: float = 0.0)
 
 
 def run_study(
-    study: Study, folder: Path, *, budget_seconds: float = math.inf, progress: StageProgress | None = None
+    study: Study, folder: Path, *, budget_seconds: float = math.inf, progress: StageProgress = no_progress
 ) -> tuple[Table, list[Settings]]:
     """Measure a study's plan into ``folder/NAME.csv``.
 
@@ -299,8 +299,7 @@ def run_study(
                 file.write(_line(_cells(subject, row)))
             rows.append(row)
             measured += work
-            if progress is not None:
-                progress("measure", measured, total)
+            progress("measure", measured, total)
             if not probes:
                 probes.append(row.cost.value)
             elif len(rows) % PROBE_EVERY == 0 or settings is left[-1]:

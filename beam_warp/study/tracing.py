@@ -14,7 +14,8 @@ import warp as wp
 
 from beam_warp._version import __version__
 from beam_warp.device.arrays import resolve_device, upload
-from beam_warp.jobs.listeners import StageProgress
+from beam_warp.image.metrics import root_mean_square
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.kernels.common.launching import thread_count
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, StudySubject
@@ -47,7 +48,7 @@ def tracing_study(
     device: str | None = None,
     references_file: Path | None = None,
     reference_seconds: float = np.inf,
-    progress: StageProgress | None = None,
+    progress: StageProgress = no_progress,
 ) -> Study:
     """Prepare the tracing study: scenes, points, normals and references; measuring is left to `run_study`.
 
@@ -197,10 +198,6 @@ class _Bench:
 
     def metrics(self, environment_name: str) -> tuple[Metric, ...]:
         """Return the errors of the study."""
-
-        def root_mean_square(array: Any) -> float:
-            return float(np.sqrt(np.square(array, dtype=np.float64).mean()))
-
         rays = f"{self.plan.reference_rays:,} rays"
         return (
             Metric(

@@ -17,7 +17,7 @@ from beam_warp.device.arrays import upload
 from beam_warp.digests import code_digest
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.files import replacing
-from beam_warp.jobs.listeners import StageProgress
+from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.kernels.trace.surface_rays import launch_local_surface
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.normals import estimate_normals
@@ -87,7 +87,7 @@ def find_references(
     *,
     file: Path | None = None,
     seconds: float = np.inf,
-    progress: StageProgress | None = None,
+    progress: StageProgress = no_progress,
 ) -> References:
     """Choose points and trace their references, or take them from an earlier run's file if nothing has changed.
 
@@ -108,7 +108,6 @@ def find_references(
     kept = _load(file, fingerprint) if file is not None else None
     if kept is not None:
         return kept
-    report: StageProgress = progress or (lambda stage, done, total: None)
     seen = np.flatnonzero(cloud.opacities > 1.0 / 255.0)
     if len(seen) < 2:
         raise InvalidArrayError(
@@ -116,7 +115,7 @@ def find_references(
         )
     normals = cloud.normals
     if normals is None:
-        normals = estimate_normals(cloud, scene, progress=lambda done, total: report("normals", done, total)).normals
+        normals = estimate_normals(cloud, scene, progress=lambda done, total: progress("normals", done, total)).normals
     number = min(plan.points or POINTS[scene.device.is_cuda], len(seen))
     chosen = np.random.default_rng(plan.seed).permutation(seen)[:number]
     light = PreparedEnvironment(environment, scene.device)
@@ -125,7 +124,7 @@ def find_references(
         rows = chosen[start : start + BLOCK[scene.device.is_cuda]]
         blocks.append(_trace_block(cloud.positions[rows], normals[rows], light, plan, scene, len(blocks)))
         done = min(start + len(rows), number)
-        report("references", done, number)
+        progress("references", done, number)
         spent = time.perf_counter() - started
         if spent + spent / done * len(rows) > seconds:
             break

@@ -53,6 +53,14 @@ class MaterialMesh:
         require_range("base_color", self.base_color, 0.0, 1.0)
         require_range("roughness", self.roughness, 0.0, 1.0)
 
+    def beside(self, other: MaterialMesh) -> MaterialMesh:
+        """Return both meshes as one, this one's vertices and triangles first."""
+        joined = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)])
+            for name in ("vertices", "normals", "base_color", "roughness")
+        }
+        return MaterialMesh(faces=np.concatenate([self.faces, other.faces + len(self.vertices)]), **joined)
+
     def interpolate(self, values: ArrayLike, faces: ArrayLike, weights: ArrayLike) -> NDArray[np.float64]:
         """Return vertex values at points of the surface.
 

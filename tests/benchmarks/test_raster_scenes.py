@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 from gsplat_peer import GsplatPeer, GsplatUnavailableError, arguments
-from raster_scenes import BUMP, VALUE_COUNT, bumpy_sphere, cube, figure
+from raster_scenes import BUMP, bumpy_sphere, cube, figure
 from tracing_scenes import FLATNESS
 
 from beam_warp.world.quaternions import rotation_matrices
@@ -65,7 +65,7 @@ def test_scenes_belong_to_their_seed(make):
         np.testing.assert_array_equal(array, again.cloud.arrays()[name])
     assert not np.array_equal(first.cloud.positions, other.cloud.positions)
     values = first.values()
-    assert values.shape == (500, VALUE_COUNT)
+    assert values.shape == (500, 11)
     assert values.dtype == np.float32
     assert first.cloud.opacities.max() <= 0.98
     assert first.cloud.is_relightable

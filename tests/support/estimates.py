@@ -9,10 +9,6 @@ SIGNIFICANCE = 1e-4
 LARGEST_Z = stats.norm.isf(SIGNIFICANCE / 2)
 
 
-def rms(errors):
-    return np.sqrt(np.mean(np.asarray(errors, dtype=np.float64) ** 2))
-
-
 def require_density(counts, mass, least=20.0):
     """Draws fall into cells as often as their mass says; cells that expect fewer than ``least`` count as one."""
     counts, expected = np.ravel(counts), np.ravel(mass) * np.sum(counts)

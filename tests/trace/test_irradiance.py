@@ -6,13 +6,14 @@ from itertools import product
 import numpy as np
 import pytest
 import warp as wp
-from support.estimates import LARGEST_Z, require_density, require_honest, require_zero_mean, rms
+from support.estimates import LARGEST_Z, require_density, require_honest, require_zero_mean
 from support.kernel_runs import run_kernel
 from support.shapes import cloud_of, disc_points, random_cloud, tiles, unit
 from support.split_sum import texels_of
 
 from beam_warp import Scene, ambient_occlusion
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.kernels.light.environment_sampling import EnvironmentDistribution
 from beam_warp.kernels.light.product_sampling import EnvironmentBlocks
 from beam_warp.kernels.trace.incident_light import Technique, draw_light, launch_sum_unshadowed, mixture_pdf
@@ -155,7 +156,7 @@ class TestUnbiased:
 
         def error(count):
             options = {"sample_count": count, "density": density, "sampler": sampler, "ratio": False}
-            return rms(in_the_clutter(device, light, **options).value - truth)
+            return root_mean_square(in_the_clutter(device, light, **options).value - truth)
 
         few, many = error(16), error(256)
         # 200 points: a root mean square is known to 4 % if errors are normal, and to 10 % for heavier tails
@@ -201,7 +202,7 @@ def test_one_column_of_strata_takes_most_of_the_error(device, density, sample_co
     for sampler in ("stratified", "iid"):
         options = {"density": density, "sampler": sampler, "sample_count": sample_count, "ratio": False}
         result = irradiance(empty(device), np.zeros((count, 3)), np.tile(UP, (count, 1)), light, **options)
-        errors[sampler] = result.value.std(), rms(result.standard_error)
+        errors[sampler] = result.value.std(), root_mean_square(result.standard_error)
     assert (np.array(errors["stratified"]) < 0.5 * np.array(errors["iid"])).all()
 
 

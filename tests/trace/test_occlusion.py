@@ -4,11 +4,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.estimates import require_honest, require_zero_mean, rms
+from support.estimates import require_honest, require_zero_mean
 from support.shapes import cloud_of, disc_points, random_cloud, sphere_points, tiles, unit
 
 from beam_warp import Scene, ambient_occlusion
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.trace.sampling import SAMPLERS
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -108,7 +109,7 @@ class TestErrors:
 
         def error(count):
             result = ambient_occlusion(scene, points, n, sample_count=count, offset=0.1, sampler=sampler)
-            return rms(result.visibility - truth)
+            return root_mean_square(result.visibility - truth)
 
         # 300 points know a root mean square to 1 / sqrt(600) if errors are normal, and to three times that if not
         gain = error(16) / error(256)

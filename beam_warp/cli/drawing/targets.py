@@ -9,10 +9,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-
 from beam_warp.cli.common.flags import stated
 from beam_warp.cli.drawing.flags import DeferredFlags, Render
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.records import RasterOptions
 from beam_warp.render.options import UNSHADOWED, DeferredOptions
@@ -68,7 +67,7 @@ class Watched:
         """Return what was reached in a command's time [s]: the error in pixels that the pilot did not look at."""
         error = None
         if self.noises:
-            error = float(np.sqrt(np.mean(np.square(self.noises))))
+            error = root_mean_square(self.noises)
         elif target.error is not None and self.last is not None:
             shot, image, _ = self.last
             error = TruePixels.traced(shot, raster, device, seed=1).error(image).value

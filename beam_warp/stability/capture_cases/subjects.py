@@ -85,7 +85,7 @@ def object_appears(at: StressStudio) -> CaptureStress:
     first = max(1, at.frame_count // 2)
 
     def appearing() -> list[MaterialMesh]:
-        return [mesh if frame < first else beside(mesh, ball()) for frame, mesh in enumerate(at.dancing())]
+        return [mesh if frame < first else mesh.beside(ball()) for frame, mesh in enumerate(at.dancing())]
 
     return CaptureStress(
         capture=at.traced("an object appears", appearing), required=(Detection(NEW_SURFACE, frame=first),)
@@ -125,12 +125,3 @@ def ball() -> MaterialMesh:
         base_color=np.tile(SPHERE_COLOR, (len(normals), 1)),
         roughness=np.full(len(normals), 0.4),
     )
-
-
-def beside(mesh: MaterialMesh, other: MaterialMesh) -> MaterialMesh:
-    """Return two meshes as one, the first's vertices and triangles first."""
-    joined = {
-        name: np.concatenate([getattr(mesh, name), getattr(other, name)])
-        for name in ("vertices", "normals", "base_color", "roughness")
-    }
-    return MaterialMesh(faces=np.concatenate([mesh.faces, other.faces + len(mesh.vertices)]), **joined)

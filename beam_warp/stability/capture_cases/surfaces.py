@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from beam_warp.stability.capture_cases.case import CaptureStress
 from beam_warp.stability.capture_cases.studio import StressStudio
-from beam_warp.stability.capture_cases.subjects import GREY_ROUGHNESS, beside, plain
+from beam_warp.stability.capture_cases.subjects import GREY_ROUGHNESS, plain
 from beam_warp.stability.suite import stability_case
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.mesh import MaterialMesh, vertex_normals
@@ -42,7 +42,9 @@ def pixel(at: StressStudio) -> float:
 
 def accompanied(at: StressStudio, name: str, *others: MaterialMesh) -> CaptureStress:
     """Return the capture of the figure beside still objects."""
-    return CaptureStress(capture=at.traced(name, lambda: [reduce(beside, others, mesh) for mesh in at.dancing()]))
+    return CaptureStress(
+        capture=at.traced(name, lambda: [reduce(MaterialMesh.beside, others, mesh) for mesh in at.dancing()])
+    )
 
 
 @stability_case(

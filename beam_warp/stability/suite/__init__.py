@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from beam_warp.errors import BeamError
-from beam_warp.jobs.listeners import CountProgress
+from beam_warp.jobs.listeners import CountProgress, no_progress
 from beam_warp.world.gaussians import GaussianCloud
 
 Case = TypeVar("Case")
@@ -128,7 +128,7 @@ def attempt(work: Callable[[], Result]) -> Attempt[Result]:
 
 
 def run_suite(
-    cases: Sequence[Case], run: Callable[[Case], Iterable[Row]], progress: CountProgress | None = None
+    cases: Sequence[Case], run: Callable[[Case], Iterable[Row]], progress: CountProgress = no_progress
 ) -> Iterator[Row]:
     """Run case after case.
 
@@ -139,5 +139,4 @@ def run_suite(
     """
     for done, case in enumerate(cases, start=1):
         yield from run(case)
-        if progress is not None:
-            progress(done, len(cases))
+        progress(done, len(cases))
