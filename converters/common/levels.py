@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.converters.common.errors import malformed
+from beam_warp.converters.common.errors import malformed, unreadable
 from beam_warp.converters.common.frames import DecodedFrame
 from beam_warp.errors import AssetFormatError, MissingFileError
 
@@ -62,7 +62,7 @@ class Index:
                 raise malformed(path, f"an index must have at most {_MOST_VALUES} values", "more", _REMEDY)
             content = _parsed(text)
         except OSError as error:
-            raise MissingFileError(f"input must be readable, got {error.strerror} at {path}. Check it.") from error
+            raise unreadable(path, error) from error
         except (ValueError, RecursionError) as error:
             raise malformed(path, "an index must be JSON", " ".join(str(error).split())[:120], _REMEDY) from error
         if not isinstance(content, dict):

@@ -19,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.converters.common.errors import malformed
+from beam_warp.converters.common.errors import malformed, opened, unreadable
 from beam_warp.errors import AssetFormatError, MissingFileError
 
 GLB_HEADER, GLB_CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -194,18 +194,13 @@ def read_gltf(path: Path) -> GltfFile:
         MissingFileError: There is no such file, or it cannot be opened.
         AssetFormatError: It is no glTF 2.0, is cut short, or requires an extension that is not read.
     """
-    if not path.is_file():
-        raise MissingFileError(f"input must be an existing file, got {path}. Check the path.")
-    try:
-        with path.open("rb") as file:
-            start, size = file.read(GLB_HEADER.size), path.stat().st_size
-            if start[:4] != b"glTF":
-                return GltfFile(path, _document(path, start + file.read()), None)
-            places = _chunks(path, file, start, size)
-            file.seek(places["JSON"][0])
-            return GltfFile(path, _document(path, file.read(places["JSON"][1])), places.get("BIN"))
-    except OSError as error:
-        raise MissingFileError(f"input must be readable, got {error.strerror} at {path}. Check it.") from error
+    with opened(path) as file:
+        start, size = file.read(GLB_HEADER.size), path.stat().st_size
+        if start[:4] != b"glTF":
+            return GltfFile(path, _document(path, start + file.read()), None)
+        places = _chunks(path, file, start, size)
+        file.seek(places["JSON"][0])
+        return GltfFile(path, _document(path, file.read(places["JSON"][1])), places.get("BIN"))
 
 
 def _bytes(path: Path, count: int, offset: int = 0) -> NDArray[np.uint8]:
@@ -213,7 +208,7 @@ def _bytes(path: Path, count: int, offset: int = 0) -> NDArray[np.uint8]:
     try:
         return np.fromfile(path, np.uint8, count, offset=offset)
     except OSError as error:
-        raise MissingFileError(f"input must be readable, got {error.strerror} at {path}. Check it.") from error
+        raise unreadable(path, error) from error
 
 
 def _chunks(path: Path, file: BinaryIO, start: bytes, size: int) -> dict[str, tuple[int, int]]:

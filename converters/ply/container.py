@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.blocks import for_each_block
-from beam_warp.converters.common.errors import malformed
-from beam_warp.errors import MissingFileError
+from beam_warp.converters.common.errors import malformed, opened
 
 MAX_HEADER_BYTES = 64 * 1024
 MAX_ELEMENTS = 16
@@ -158,14 +157,9 @@ def read_header(path: Path) -> PlyHeader:
         MissingFileError: There is no such file, or it cannot be opened.
         AssetFormatError: The header is malformed or too large, or promises more bytes than the file has.
     """
-    if not path.is_file():
-        raise MissingFileError(f"input must be an existing file, got {path}. Check the path.")
-    try:
-        with path.open("rb") as file:
-            start = file.read(MAX_HEADER_BYTES)
-            file_size = file.seek(0, io.SEEK_END)
-    except OSError as error:
-        raise MissingFileError(f"input must be readable, got {error.strerror} at {path}. Check it.") from error
+    with opened(path) as file:
+        start = file.read(MAX_HEADER_BYTES)
+        file_size = file.seek(0, io.SEEK_END)
     lines, data_start = _header_lines(path, start)
 
     encoding: str | None = None

@@ -29,11 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.converters.common.activations import exp_scale
-from beam_warp.converters.common.errors import malformed
+from beam_warp.converters.common.errors import malformed, opened
 from beam_warp.converters.common.frames import DecodedFrame
 from beam_warp.converters.common.options import ReadOptions
 from beam_warp.converters.common.rotations import SMALLER_LIMIT, from_smaller
-from beam_warp.errors import MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.world.gaussians import MAX_SH_DEGREE
 from beam_warp.world.metadata import UNSTATED_RASTER
@@ -119,7 +118,7 @@ class SpzHeader:
 
 def probe(path: Path) -> SpzHeader:
     """Read the header and check that the file is as long as it says."""
-    with _opened(path) as file:
+    with opened(path) as file:
         header = _read_header(file, path)
         if header.version == 4:
             _read_table(file, header, path)
@@ -137,7 +136,7 @@ def decode(path: Path, options: ReadOptions) -> DecodedFrame:
         AssetFormatError: The header, the compression or a count is malformed.
     """
     del options  # they are settled when the frame is placed
-    with _opened(path) as file:
+    with opened(path) as file:
         return unpack(file, path)
 
 
@@ -163,16 +162,6 @@ def unpack(file: BinaryIO, path: Path) -> DecodedFrame:
         raster=(True, UNSTATED_RASTER[1]) if header.flags & ANTIALIASED else None,
         notes=tuple(notes),
     )
-
-
-def _opened(path: Path) -> BinaryIO:
-    """Open a file for reading."""
-    if not path.is_file():
-        raise MissingFileError(f"input must be an existing file, got {path}. Check the path.")
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise MissingFileError(f"input must be readable, got {error.strerror} at {path}. Check it.") from error
 
 
 def _size(file: BinaryIO) -> int:
