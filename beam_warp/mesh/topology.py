@@ -63,7 +63,7 @@ def mesh_report(mesh: trimesh.Trimesh) -> MeshReport:
     )
 
 
-def face_parts(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
+def face_parts(faces: ArrayLike, vertex_count: int) -> NDArray[np.integer[Any]]:
     """Return the number of the connected part that each face belongs to, ``(F,)``; parts share no vertex."""
     index = np.asarray(faces).reshape(-1, 3)
     return connected_component_labels(np.concatenate([index[:, :2], index[:, 1:]]), vertex_count)[index[:, 0]]
