@@ -84,7 +84,7 @@ class Container:
         _require(tracks.keys() >= REQUIRED, f"the static block must hold {', '.join(sorted(REQUIRED))}", sorted(tracks))
         self._raw = self._values(tracks, 0, self.manifest["static"]["file"], {})
         self.still: Arrays = {name: activated(name, values) for name, values in self._raw.items()}
-        self._unpacked = -1, dict[str, Track]()
+        self._unpacked: tuple[Any, dict[str, Track]] = None, {}
 
     def _manifest(self) -> bytes:
         """Return the manifest: a file, or the first entry of an archive, which is stored as it is."""
@@ -125,12 +125,10 @@ class Container:
 
     def frame(self, number: int) -> Arrays:
         """Return the arrays of a frame by name, ``(C, N)``: quaternions xyzw, linear scales, unit normals."""
-        segments = self.manifest["segments"]
-        index = next(i for i, entry in enumerate(segments) if number < entry["first"] + entry["frames"])
-        if self._unpacked[0] != index:
-            self._unpacked = index, self.tracks(segments[index], segments[index]["frames"])
-        tracks, at = self._unpacked[1], number - segments[index]["first"]
-        raw = self._values(tracks, at, segments[index]["file"], self._raw)
+        entry = next(entry for entry in self.manifest["segments"] if number < entry["first"] + entry["frames"])
+        if self._unpacked[0] is not entry:
+            self._unpacked = entry, self.tracks(entry, entry["frames"])
+        raw = self._values(self._unpacked[1], number - entry["first"], entry["file"], self._raw)
         turn = quaternions(raw.pop("turns")) if "turns" in raw else None
         arrays = self.still | {name: activated(name, values) for name, values in raw.items()}
         for name, turned in (("orientations", product), ("normals", rotated)):
@@ -187,14 +185,16 @@ def _tracks(packed: bytes, entry: dict[str, Any], frames: int, count: int) -> di
     stream, lengths = (io.BytesIO(packed), parts) if parts else (io.BytesIO(content), [at, *sizes])
     end = at + sum(sizes)
     _require(end == entry["unpacked"] and len(content) == (at if parts else end), f"planes must fill {end} bytes", at)
+    room = np.empty((sum(len(summed) for array in arrays for summed, _ in array["planes"]), count), np.float32)
     following = iter(list(zip([stream.read(length) for length in lengths][1:], sizes, strict=True)))
     for array in arrays:
         track = found[array["name"]] = []
         for summed, plain in array["planes"]:
             planes = [partial(_plane, *next(following), width, bool(parts)) for width in (*summed, *plain)]
-            sums = [np.cumsum(unpack(), dtype=np.int32) for unpack in planes[: len(summed)]]
-            rows = np.array(sums, np.float32).reshape(len(summed), count)
-            track.append(Component(weights.pop(0), rows, planes[len(summed) :]))
+            sums, room = np.split(room, [len(summed)])  # of one room: many pieces of memory cost more page faults
+            for row, unpack in zip(sums, planes, strict=False):
+                row[:] = np.cumsum(unpack(), dtype=np.int32)
+            track.append(Component(weights.pop(0), sums, planes[len(summed) :]))
     return found
 
 
