@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from beam_warp.capture.lenses import Lens
 from beam_warp.checks import require_number
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
-from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
+from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear, straight
 from beam_warp.image.files import Image
 from beam_warp.world.camera import Camera
 
@@ -143,7 +143,7 @@ class Undistortion:
                 light = resampling.sample(_premultiplied(plane, weight, image), _catmull_rom)
                 channels[name] = _encoded(light, smooth, image)
             elif plane.dtype.kind == "f":
-                channels[name] = _divided(resampling.sample(plane * weight, _linear), mean)
+                channels[name] = straight(resampling.sample(plane * weight, _linear), mean)
             else:
                 channels[name] = resampling.nearest(plane)
         return replace(image, channels=channels)
@@ -290,15 +290,10 @@ def _catmull_rom(t: NDArray[np.float32]) -> list[NDArray[Any]]:
     ]
 
 
-def _divided(product: NDArray[np.float32], weight: Coverage) -> NDArray[np.float32]:
-    """Divide a product by its weight; 0 where the weight is 0."""
-    return np.divide(product, weight, out=np.zeros_like(product), where=weight > 0.0)
-
-
 def _premultiplied(color: NDArray[np.float32], alpha: Coverage, image: Image) -> NDArray[np.float32]:
     """Return an image's colour as scene-linear light multiplied by alpha."""
     if image.color_space == DISPLAY_SRGB:  # the curve applies to the colour, not to its product
-        color = srgb_to_linear(_divided(color, alpha) if image.premultiplied else color)
+        color = srgb_to_linear(straight(color, alpha) if image.premultiplied else color)
         return color * alpha
     return color if image.premultiplied else color * alpha
 
@@ -306,6 +301,6 @@ def _premultiplied(color: NDArray[np.float32], alpha: Coverage, image: Image) ->
 def _encoded(light: NDArray[np.float32], alpha: NDArray[np.float32], image: Image) -> NDArray[np.float32]:
     """Undo `_premultiplied`."""
     if image.color_space == DISPLAY_SRGB:
-        straight = linear_to_srgb(_divided(light, alpha))
-        return straight * alpha if image.premultiplied else straight
-    return light if image.premultiplied else _divided(light, alpha)
+        encoded = linear_to_srgb(straight(light, alpha))
+        return encoded * alpha if image.premultiplied else encoded
+    return light if image.premultiplied else straight(light, alpha)

@@ -19,6 +19,11 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Rec.709 weights of linear R, G and B in luminance."""
 
 
+def straight(premultiplied: NDArray[Any], alpha: ArrayLike) -> NDArray[Any]:
+    """Return colour that was multiplied by its alpha, which is broadcast; 0 where alpha is 0."""
+    return np.divide(premultiplied, alpha, out=np.zeros_like(premultiplied), where=np.greater(alpha, 0.0))
+
+
 def srgb_to_linear(srgb: ArrayLike) -> NDArray[Any]:
     """Decode display sRGB to linear light (IEC 61966-2-1), any shape, odd about zero so that all values have inverses.
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
+from beam_warp.image.color import straight
 from beam_warp.image.files import display_image
 
 BACKGROUND = 0.13
@@ -28,8 +29,7 @@ def gray(values: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def display_color(image: NDArray[np.floating], alpha: NDArray[np.floating], stops: float = 0.0) -> NDArray[np.floating]:
     """Return premultiplied radiance as straight display colour in [0, 1]."""
-    straight = np.divide(image, alpha[..., None], out=np.zeros_like(image), where=alpha[..., None] > 0.0)
-    return display_image(straight, stops) / 255.0
+    return display_image(straight(image, alpha[..., None]), stops) / 255.0
 
 
 def over_background(display: NDArray[np.floating], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:

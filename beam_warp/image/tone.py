@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.checks import require_array, require_choice, require_finite, require_number, require_range
-from beam_warp.image.color import srgb_to_linear
+from beam_warp.image.color import srgb_to_linear, straight
 from beam_warp.image.files import display_image
 
 ViewTransform: TypeAlias = Literal["standard", "aces", "agx", "neutral"]
@@ -120,13 +120,13 @@ def display_over(
     coverage = require_array("alpha", alpha, rgb.shape[:2])
     require_range("alpha", coverage, 0.0, 1.0)
     opacity = coverage[..., None]
-    straight = np.divide(rgb, opacity, out=np.zeros_like(rgb), where=opacity > 0.0)
+    color = straight(rgb, opacity)
     if background is not None:
         behind = require_array("background", background, (3,))
         require_range("background", behind, 0.0, 1.0, "Use display values from 0 to 1.")
-        shown = display_linear(straight, transform, exposure_stops)
+        shown = display_linear(color, transform, exposure_stops)
         return display_image(opacity * shown + (1.0 - opacity) * srgb_to_linear(behind))
-    color = display(straight, transform, exposure_stops)
+    color = display(color, transform, exposure_stops)
     if (coverage == 1.0).all():
         return color
     return np.concatenate([color, np.rint(opacity * 255.0).astype(np.uint8)], axis=-1)

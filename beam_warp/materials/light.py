@@ -82,11 +82,10 @@ class LightCheck:
         best_rotation_degrees: Turn by which it fits best, as `EnvironmentMap.rotated` takes it, in (-180, 180]; of
             the mirrored map if ``is_mirrored``.
         is_mirrored: Whether it fits best with its columns in reverse order.
-        spread_as_given: Mean absolute difference of the logarithms of neighbours' base colours.
-        spread_best: The same at the best turn.
+        spread_best: Mean absolute difference of the logarithms of neighbours' base colours at the best turn.
         spread_even: The same under a light that is the same from all sides.
-        gloss_as_given: Correlation of what changes from view to view with the gloss expected; 0 where nothing does.
-        gloss_best: The same at the best turn.
+        gloss_best: Correlation of what changes from view to view with the gloss expected at the best turn; 0 where
+            nothing does.
         misfit_as_given: Logarithm of how much is left unexplained by either, above the best turn's.
         certainty: Difference of misfit between the light as stated, or nearly so, and the best of all others, over the
             difference that chance may make; above 1 the light is not the one that was stated.
@@ -97,10 +96,8 @@ class LightCheck:
 
     best_rotation_degrees: float = 0.0
     is_mirrored: bool = False
-    spread_as_given: float = 0.0
     spread_best: float = 0.0
     spread_even: float = 0.0
-    gloss_as_given: float = 0.0
     gloss_best: float = 0.0
     misfit_as_given: float = 0.0
     certainty: float = 0.0
@@ -186,10 +183,8 @@ def judge_light(evidence: LightEvidence, environment: EnvironmentMap) -> LightCh
     check = LightCheck(
         best_rotation_degrees=_refined(fits, best),
         is_mirrored=best >= LIGHT_COLUMNS,
-        spread_as_given=float(fits.spreads[0]),
         spread_best=float(fits.spreads[best]),
         spread_even=float(fits.spreads[EVEN]),
-        gloss_as_given=float(fits.gloss[0]),
         gloss_best=float(fits.gloss[best]),
         misfit_as_given=float(fits.misfits[0] - fits.misfits[best]),
         certainty=fits.clearly(rival, _best(fits, near)),

@@ -49,7 +49,7 @@ from beam_warp.trace.sampling import SAMPLERS, Sampler, sample_set
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import TraceOptions, trace_rays
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.harmonics import SH_C0, even_directions
 
 BOUNCE_PART = 4
 """The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""
@@ -174,11 +174,7 @@ def _over_light(light: GatheredLight) -> NDArray[np.float32]:
 
 def view_set() -> NDArray[np.float32]:
     """Return unit directions towards viewers, evenly over the visible side of +z, ``(VIEW_COUNT, 3)``."""
-    index = np.arange(VIEW_COUNT) + 0.5
-    z = 1.0 - (1.0 - SMALLEST_VIEW_COSINE) * index / VIEW_COUNT
-    phi = np.pi * (1.0 + np.sqrt(5.0)) * index
-    radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1).astype(np.float32)
+    return even_directions(VIEW_COUNT, last=SMALLEST_VIEW_COSINE).astype(np.float32)
 
 
 def lit_points(

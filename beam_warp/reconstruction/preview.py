@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError
-from beam_warp.image.files import display_image
-from beam_warp.image.panels import Panel, lay_out, over_background
+from beam_warp.image.color import straight
+from beam_warp.image.panels import Panel, display_color, lay_out, over_background
 from beam_warp.kernels.reconstruction.display_encoding import launch_average
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
@@ -74,7 +74,7 @@ def reconstruction_preview(
     panels: list[Panel] = []
     for index, (view, (radiance, normals, alpha)) in enumerate(zip(views, drawn, strict=True)):
         photograph = _shown(view)
-        render = over_background(display_image(_straight(radiance, alpha)) / 255.0, alpha)
+        render = over_background(display_color(radiance, alpha[..., 0]), alpha)
         difference = np.abs(photograph.astype(np.int16) - render) * AMPLIFICATION
         if view.alpha is None:  # nothing is known of what lies around the subject
             difference = np.rint(difference * alpha)
@@ -82,7 +82,7 @@ def reconstruction_preview(
             (f"{view.name}: photograph", photograph),
             ("render", render),
             (f"difference, {AMPLIFICATION} times", np.minimum(difference, 255).astype(np.uint8)),
-            ("normals (x, y, z as r, g, b)", over_background(0.5 * _straight(normals, alpha) + 0.5, alpha)),
+            ("normals (x, y, z as r, g, b)", over_background(0.5 * straight(normals, alpha) + 0.5, alpha)),
         ]
         if shadings:
             row.append(("mesh", shadings[index]))
@@ -154,13 +154,7 @@ def _reduction(camera: Camera, most_rows: int) -> int:
 def _shown(view: CapturedView) -> NDArray[np.uint8]:
     """Return a photograph for a display, over the background where its coverage is known."""
     alpha = np.ones(view.color.shape[:2], np.float32) if view.alpha is None else view.alpha
-    covered = alpha[..., None]
-    return over_background(display_image(_straight(view.color, covered)) / 255.0, covered)
-
-
-def _straight(premultiplied: NDArray[np.floating], alpha: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return an image without its alpha; 0 where that is 0."""
-    return np.divide(premultiplied, alpha, out=np.zeros_like(premultiplied), where=alpha > 0.0)
+    return over_background(display_color(view.color, alpha), alpha[..., None])
 
 
 def _enlarged(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -39,6 +39,7 @@ from beam_warp.capture.silhouettes import contradicting
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import AssetFormatError, InvalidArrayError
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction.alignment import NUMBERS, Evidence, evidence, flow_of, rows_of, strength
 from beam_warp.reconstruction.fit import FitOptions, Fitter
@@ -345,7 +346,7 @@ class RigFitter(Fitter):
     def is_lost(self) -> bool:
         """Tell whether a camera is too far off, or too little is known, for steps to lead anywhere."""
         is_poor = float(np.nanmedian(self.quality)) < POOR
-        return is_poor or self.is_far() or bool(self.behind().any()) or _root_mean_square(self.errors()) > WORST_ERROR
+        return is_poor or self.is_far() or bool(self.behind().any()) or root_mean_square(self.errors()) > WORST_ERROR
 
     def steps(self) -> list[NDArray[np.float64]]:
         """Return what the photographs say is wrong with each camera, ``(11,)`` each."""
@@ -365,7 +366,7 @@ class RigFitter(Fitter):
         """Tell whether steps were within their errors."""
         points = self.surface()
         moved = [pixels_of(*pair, points) for pair in zip(self.cameras, steps, strict=True)]
-        return _root_mean_square(moved) < SETTLED * _root_mean_square(self.errors())
+        return root_mean_square(moved) < SETTLED * root_mean_square(self.errors())
 
     def errors(self) -> list[float]:
         """Return how well each photograph tells what is moved of its camera [pixel]."""
@@ -405,13 +406,13 @@ def wrong_kinds(found: Sequence[Evidence], known: Sequence[str] = ()) -> tuple[s
         return (first,)
     base = tuple(known) or (first,)
     sizes = {kind: strength(found, [*base, kind], kind) for kind in others if kind not in base}
-    certain = {kind: _root_mean_square(size) for kind, size in sizes.items() if is_certain(size)}
+    certain = {kind: root_mean_square(size) for kind, size in sizes.items() if is_certain(size)}
     return (*base, max(certain, key=lambda kind: certain[kind])) if certain else tuple(known)
 
 
 def is_certain(strengths: NDArray[np.float64]) -> bool:
     """Tell whether corrections that are so many standard errors are beyond doubt, together or one alone."""
-    return bool(_root_mean_square(strengths) > CERTAIN or strengths.max() > CERTAIN_ALONE)
+    return bool(root_mean_square(strengths) > CERTAIN or strengths.max() > CERTAIN_ALONE)
 
 
 def _corner(view: CapturedView, part: CapturedView) -> tuple[int, int]:
@@ -527,7 +528,7 @@ def distortion_of(given: Sequence[Camera], found: Sequence[Evidence], points: ND
         return 0.0
     moves = np.stack([says.solved(kinds)[0] for says in found])
     moves[:, rows_of(kinds[:1])] = 0.0
-    return _root_mean_square([pixels_of(*pair, points) for pair in zip(given, moves, strict=True)])
+    return root_mean_square([pixels_of(*pair, points) for pair in zip(given, moves, strict=True)])
 
 
 def pixels_of(camera: Camera, move: NDArray[np.float64], points: NDArray[np.float64]) -> float:
@@ -540,7 +541,3 @@ def error_of(camera: Camera, covariance: NDArray[np.float64], points: NDArray[np
     """Return the standard error of where an image shows points [pixel], from the covariance of its camera's numbers."""
     part = flow_of(camera, points)
     return float(np.sqrt(np.einsum("iap,ij,jap->p", part, covariance, part).mean())) if part.size else 0.0
-
-
-def _root_mean_square(values: Sequence[float] | NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
