@@ -178,7 +178,7 @@ class FitOptions:
                 "color_iterations": 150,
                 "normal_iterations": 300,
                 "refine_every": 100,
-                "rates": LearningRates(final_others=1.0),
+                "rates": LearningRates(positions=8e-4, scales=2e-2, opacities=6e-2, bands=1e-3, final_others=1.0),
             },
             "paper": {
                 **common,

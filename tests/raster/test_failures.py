@@ -12,8 +12,13 @@ from support.drawn_hazards import EXPONENTIAL_ULPS, STABILITY, Drawn, remoteness
 from support.raster_hazards import HAZARDS, ahead, make
 
 from beam_warp.device.arrays import upload
+from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.rasterizer import Rasterizer
-from beam_warp.raster.records import GaussianArrays
+from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.world.camera import Camera
+from beam_warp.world.gaussians import GaussianCloud
+from beam_warp.world.harmonics import even_directions
+from beam_warp.world.quaternions import turns_from_z
 
 OUTPUTS = ("alpha", "depth", "median_depth", "channels", "normals")
 
@@ -203,3 +208,33 @@ def test_broken_rows_leave_the_others_alone(device, rng):
     found, wanted = bad.gradients(upstream), good.gradients(upstream)
     for name, array in wanted.items():
         np.testing.assert_array_equal(found[name][6:], array[6:])
+
+
+def outline_of_discs(device, thickness):
+    """How far outside a sphere of 15 cm discs that lie on it draw its outline, and its middle [m]."""
+    outward, radius, away, side = even_directions(5000), 0.15, 3.0, 160
+    spread = 0.7 * radius * np.sqrt(4.0 * np.pi / len(outward))
+    ball = GaussianCloud(
+        positions=radius * outward,
+        orientations=turns_from_z(outward),
+        scales=np.tile([spread, spread, thickness], (len(outward), 1)),
+        opacities=np.full(len(outward), 0.8),
+        axes="rfu",
+    )
+    camera = Camera.look_at((0.0, -away, 0.0), (0, 0, 0), width=side, height=side, vertical_fov=8.0)
+    options = RasterOptions(antialiased=True, low_pass=0.1)
+    image = rasterize(ball, camera, channels=(), options=options, device=str(device))
+    tangent = np.sqrt(image.alpha.sum() / np.pi) / camera.focal_x  # of half the angle that the ball covers
+    middle = image.median_depth[side // 2 - 1 : side // 2 + 1, side // 2 - 1 : side // 2 + 1]
+    return away * np.sin(np.arctan(tangent)) - radius, away - middle.mean() - radius
+
+
+def test_an_outline_of_soft_discs_lies_outside_their_planes(device):
+    """At an outline, a ray passes many discs edge-on, and their tails add up; from the front, the first disc covers.
+
+    So a fit that meets outlines sinks discs below the surface by as much. More than half of it is their thickness.
+    """
+    (thick, front), (thin, _) = outline_of_discs(device, 1e-3), outline_of_discs(device, 1e-4)
+    assert abs(front) < 2e-4
+    assert 1e-3 < thick < 4e-3
+    assert 0.0 < thin < 0.5 * thick
