@@ -161,9 +161,9 @@ class FitOptions:
     def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
         """Return the options of a preset, some of them changed.
 
-        ``fast`` is ours, ``draft`` a seventh of its steps: for a first look, and for a CPU. ``paper`` is BEAM's
-        schedule: 7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term of
-        coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter,
+        ``fast`` is ours, ``draft`` a seventh of its steps, larger ones: for a first look, and for a CPU. ``paper`` is
+        BEAM's schedule: 7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term
+        of coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter,
         normals at 0.05 for the second half. The latter two draw one sample a pixel.
 
         Raises:
