@@ -33,7 +33,7 @@ from beam_warp.image.metrics import block_means
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.channels import RADIANCE
 from beam_warp.raster.gbuffer import rasterize
-from beam_warp.reconstruction.fit import FitOptions, Fitter
+from beam_warp.reconstruction.fit import FitOptions, Fitter, LearningRates
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.initial import initial_gaussians
 
@@ -163,6 +163,7 @@ def _shown_offsets(views: Sequence[CapturedView], options: FitOptions, device: A
         target_psnr=None,
         color_iterations=VISITS * len(views),
         normal_iterations=0,
+        rates=LearningRates(),  # the preset's go with its own number of steps
         samples=1,
         temporal=0.0,
         refine_every=0,

@@ -42,7 +42,7 @@ from beam_warp.errors import AssetFormatError, InvalidArrayError
 from beam_warp.image.metrics import root_mean_square
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction.alignment import NUMBERS, Evidence, evidence, flow_of, rows_of, strength
-from beam_warp.reconstruction.fit import FitOptions, Fitter
+from beam_warp.reconstruction.fit import FitOptions, Fitter, LearningRates
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.labels import agreement_of
@@ -298,6 +298,7 @@ class RigFitter(Fitter):
             gaussian_count=len(start),
             target_psnr=None,
             normal_iterations=0,
+            rates=LearningRates(),  # the preset's go with its own number of steps
             samples=1,
             temporal=0.0,
             refine_every=0,

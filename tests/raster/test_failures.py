@@ -230,7 +230,7 @@ def outline_of_discs(device, thickness):
 
 
 def test_an_outline_of_soft_discs_lies_outside_their_planes(device):
-    """At an outline, a ray passes many discs edge-on, and their tails add up; from the front, the first disc covers.
+    """A ray at an outline passes many discs edge-on, and their tails add up; from the front, the first disc covers.
 
     So a fit that meets outlines sinks discs below the surface by as much. More than half of it is their thickness.
     """
