@@ -26,8 +26,8 @@ from beam_warp.demo.figure import build_figure
 from beam_warp.image.metrics import root_mean_square
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.trace.incident import irradiance
+from beam_warp.world.directions import even_directions
 from beam_warp.world.environment import EnvironmentMap, texel_directions
-from beam_warp.world.harmonics import even_directions
 from beam_warp.world.quaternions import turns_from_z
 
 REFERENCE_RAYS = 16_384

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb
 from beam_warp.trace.mesh_paths import TracedMesh, outgoing_radiance
+from beam_warp.world.directions import even_directions
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import even_directions, sh_basis
+from beam_warp.world.harmonics import sh_basis
 from beam_warp.world.mesh import MaterialMesh
 
 TANGENTIAL_DEVIATION = 0.7

@@ -48,8 +48,9 @@ from beam_warp.trace.rays import points_for_weights, ray_batches, room_for_rays
 from beam_warp.trace.sampling import SAMPLERS, Sampler, sample_set
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import TraceOptions, trace_rays
+from beam_warp.world.directions import even_directions
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import SH_C0, even_directions
+from beam_warp.world.harmonics import SH_C0
 
 BOUNCE_PART = 4
 """The bounce is a tenth of the light or less, so a quarter of the rays leaves its noise below that of the sky."""

@@ -21,8 +21,8 @@ from beam_warp.trace.rays import ray_offsets
 from beam_warp.trace.reference import visibility_reference
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT
+from beam_warp.world.directions import even_directions
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import even_directions
 from beam_warp.world.quaternions import turns_from_z
 
 OVERLAP = 1.0

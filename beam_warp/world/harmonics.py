@@ -1,4 +1,4 @@
-"""Real spherical harmonics in the basis and sign convention of 3DGS: evaluate, and rotate; directions to fit them in.
+"""Real spherical harmonics in the basis and sign convention of 3DGS: evaluate, and rotate.
 
 3DGS stores, for band l, the orders m = -l … l in turn, with the signs of the reference implementation of
 Kerbl et al. 2023 (Condon–Shortley phase kept in the polynomials below). Plain NumPy float64 inside.
@@ -9,16 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beam_warp.world.directions import even_directions
+
 SH_C0 = 0.28209479177387814
 """Y_0 = 1 / (2 sqrt(pi)); a DC coefficient c shows the colour 0.5 + SH_C0 c."""
-
-
-def even_directions(count: int, first: float = 1.0, last: float = -1.0) -> NDArray[np.float64]:
-    """Return a spherical Fibonacci set, ``(count, 3)``: unit vectors, z in equal steps from one height to another."""
-    index = np.arange(count) + 0.5
-    z = first + (last - first) * index / count
-    phi, radius = np.pi * (1.0 + np.sqrt(5.0)) * index, np.sqrt(np.maximum(1.0 - z * z, 0.0))
-    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1)
 
 
 def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.world.directions import even_directions
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import even_directions
 from beam_warp.world.quaternions import turns_from_z
 
 TANGENTIAL = 0.65

@@ -16,8 +16,8 @@ from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.world.camera import Camera
+from beam_warp.world.directions import even_directions
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import even_directions
 from beam_warp.world.quaternions import turns_from_z
 
 OUTPUTS = ("alpha", "depth", "median_depth", "channels", "normals")

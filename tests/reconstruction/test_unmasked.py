@@ -85,7 +85,7 @@ def test_a_photograph_of_a_statue_that_was_not_used(data_dir, device):
     drawn = rasterize(track.cloud, held.camera, channels=("radiance",), options=fitting.raster, device=device)
     rows, columns = held.camera.height // 3, held.camera.width // 3
     middle = np.s_[rows:-rows, columns:-columns]
-    assert drawn.alpha[middle].mean() > 0.9  # nothing but the statue is there: the rest is where it lets light pass
+    assert drawn.alpha[middle].mean() > 0.9  # nothing but the statue is there; other seeds cover 0.94 to 0.99 of it
     seen = (drawn.channels["radiance"] * drawn.alpha[..., None])[middle] @ LUMINANCE
     # Some 50 curls are in the middle: those of another place would correlate by 0 within 2 / sqrt(50).
     assert np.corrcoef(seen.ravel(), (held.color[middle] @ LUMINANCE).ravel())[0, 1] > 2.0 / np.sqrt(50.0)

@@ -6,8 +6,8 @@ import numpy as np
 
 from beam_warp import converters
 from beam_warp.world.camera import Camera
+from beam_warp.world.directions import even_directions
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
-from beam_warp.world.harmonics import even_directions
 from beam_warp.world.quaternions import turns_from_z
 
 

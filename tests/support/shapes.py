@@ -3,8 +3,9 @@
 import numpy as np
 
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
+from beam_warp.world.directions import even_directions
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.harmonics import SH_C0, even_directions
+from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.quaternions import turns_from_z
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from beam_warp.world.harmonics import even_directions
+from beam_warp.world.directions import even_directions
 from beam_warp.world.quaternions import turns_from_z
 
 
