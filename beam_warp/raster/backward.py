@@ -41,7 +41,8 @@ class BackwardBuffers:
             self._blocks = drawn.zero_blocks(len(drawn.channels.values), self._splats.normals)
             geometry = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec3, wp.quat, wp.vec3, float)]
             self.gaussians = GaussianGradients(*geometry, values=self._blocks.values if drawn.channels.values else None)
-        self._tracked = _with_gradients(drawn.splats, self._splats)
+        # Their own: the adjoint projects anew and writes them, with other roundings than those that were drawn.
+        self._tracked = _with_gradients(zero_splats(splat_count), self._splats)
         self._cameras: CameraBuffers | None = None
 
     def begin(self, gaussians: GaussianArrays) -> None:
@@ -75,7 +76,7 @@ class BackwardBuffers:
     def resolve(self, gaussians: GaussianArrays, to_cameras: wp.array | None) -> GaussianGradients:
         """Turn sums over pairs into the gradients of Gaussians, and of cameras if they are asked for."""
         if to_cameras is not None and self._cameras is None:
-            self._cameras = CameraBuffers(self._drawn, self._splats)
+            self._cameras = CameraBuffers(self._drawn)
         cameras = None if to_cameras is None else self._cameras
         moves = None if cameras is None else cameras.begin()
         drawn, found, splats, device = self._drawn, self.gaussians, self._splats, self._drawn.device
@@ -87,8 +88,7 @@ class BackwardBuffers:
             inputs = (gaussians.positions, gaussians.radiance, drawn.views)
             colors = (drawn.blocks.colors, self._blocks.colors)
             launch_evaluate_colors_adjoint(*inputs, *colors, found.positions, found.radiance, device, moves)
-        tracked = self._tracked if cameras is None else cameras.tracked
-        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, tracked, found[:4], device, moves)
+        launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, found[:4], device, moves)
         if cameras is not None:
             launch_sum_cameras(cameras.rows, drawn.splats, cameras.lanes, to_cameras, device)
         return found
@@ -100,15 +100,11 @@ class CameraBuffers:
     Attributes:
         rows: Derivatives to the camera of every splat, ``(V * N, 12)`` float.
         lanes: Parts of their sums.
-        tracked: Splats of their own that carry the gradients of the drawn ones: the adjoint projects anew and writes
-            them, with other roundings than those that were drawn.
     """
 
-    def __init__(self, drawn: FrameBuffers, gradients: Splats) -> None:
-        """Allocate for a frame, whose splats have these gradients."""
+    def __init__(self, drawn: FrameBuffers) -> None:
+        """Allocate for a frame."""
         count, length = drawn.splat_count, len(CAMERA_PARAMETERS)
-        with wp.ScopedDevice(drawn.device):
-            self.tracked = _with_gradients(zero_splats(count), gradients)
         self.rows = wp.zeros((count, length), dtype=float, device=drawn.device)
         self.lanes = wp.zeros((drawn.view_count * LANES, length), dtype=wp.float64, device=drawn.device)
         self._moves = wp.zeros(count, dtype=CameraMove, device=drawn.device)
@@ -132,7 +128,7 @@ def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> N
 
 
 def _with_gradients(splats: Splats, gradients: Splats) -> Splats:
-    """Return splats in the same memory whose arrays carry gradients, as `launch_project_adjoint` reads them."""
+    """Return splats in the same memory whose arrays carry gradients, as `launch_project_adjoint` takes them."""
     tracked = Splats()
     for name in ("centers", "shapes", "slopes", "bends", "normals"):
         array = getattr(splats, name)

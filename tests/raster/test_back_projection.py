@@ -98,7 +98,7 @@ def test_it_is_the_gradient_of_values(device, rng, depth):
     drawer, _ = drawn(made, VIEWS, device, np.zeros((COUNT, count), np.float32), options=RasterOptions(depth=depth))
     pixels = rng.normal(size=(len(drawer.images.alpha), 8)).astype(np.float32)
     drawer.adjoints().channels[0].assign(pixels)
-    want = drawer.backward().values.numpy()
+    want = drawer.backward().values.numpy().copy()
     got = summed(drawer, back_projected(drawer, pixels))[:, :count]
     weighed = summed(drawer, back_projected(drawer, np.abs(pixels)))[:, :count]
     assert np.abs(want).max() > 1.0
