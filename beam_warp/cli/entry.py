@@ -5,6 +5,7 @@ Modules are imported by functions, so that next to nothing is loaded before Ctrl
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -40,6 +41,7 @@ def _run(module: str) -> int:
         signal.signal(signal.SIGINT, interrupt)
     # Before NumPy is loaded. Our matrices are small and many, and threads of BLAS would spin to wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(5_000)  # else garbage is looked for in a thousand modules while they are loaded
     try:
         return with_streams_of_our_own(lambda: import_module(module).main())
     except KeyboardInterrupt:
