@@ -1,10 +1,11 @@
-"""What runs first in a program of ours: Ctrl-C that always stops, and libraries that do not talk in between.
+"""What runs first in a program of ours: Ctrl-C that always stops, and libraries that neither talk nor spin in between.
 
 Modules are imported by functions, so that next to nothing is loaded before Ctrl-C is looked after.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -38,6 +39,9 @@ def _run(module: str) -> int:
     """Import a command and run it; returns the exit code."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else whoever started us wants no interrupts
         signal.signal(signal.SIGINT, interrupt)
+    # Before NumPy is loaded. Our matrices are small and many, and threads of BLAS would spin to wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(5_000)  # else garbage is looked for in a thousand modules while they are loaded
     try:
         return with_streams_of_our_own(lambda: import_module(module).main())
     except KeyboardInterrupt:

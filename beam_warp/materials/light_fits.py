@@ -212,9 +212,9 @@ def neighbor_pairs(shown: LightEvidence, count: int) -> tuple[NDArray[np.int64],
     """Return pairs of neighbours that do not face away from each other, each once: rows of the one and the other."""
     tree, normals = cKDTree(shown.positions), shown.normals
     _, near = tree.query(tree.data, k=min(count + 1, tree.n), workers=-1)
-    pairs = np.stack([np.repeat(np.arange(tree.n), near.shape[1]), near.reshape(-1)], axis=1)
-    first, second = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0).T
-    facing = (normals[first] * normals[second]).sum(axis=1) > 0.0
+    ends = np.repeat(np.arange(tree.n), near.shape[1]), near.reshape(-1)
+    first, second = np.divmod(np.unique(np.minimum(*ends) * tree.n + np.maximum(*ends)), tree.n)
+    facing = (first != second) & ((normals[first] * normals[second]).sum(axis=1) > 0.0)
     return first[facing], second[facing]
 
 

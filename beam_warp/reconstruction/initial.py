@@ -303,6 +303,7 @@ def view_samples(
 def _facing_orientations(normals: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return quaternions xyzw that turn z into the normals."""
     z = normals.astype(np.float64)
+    z /= np.linalg.norm(z, axis=1, keepdims=True)  # else SciPy finds axes that are off by rounding, and mends each
     helper = np.where(np.abs(z[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     x = np.cross(helper, z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)

@@ -246,9 +246,11 @@ class _Solver:
         count, views, _, kinds = gloss.shape
         self._colors = colors.reshape(count, -1)
         self._weights = np.repeat(weights, 3, axis=1)
-        own = np.broadcast_to(np.tile(np.eye(3), (views, 1)), (count, 3 * views, 3))
-        self._basis = np.concatenate([own, gloss.reshape(count, 3 * views, kinds)], axis=2)
+        own = np.broadcast_to(np.tile(np.eye(3), views), (count, 3, 3 * views))
+        self._basis = np.concatenate([own, gloss.reshape(count, 3 * views, kinds).transpose(0, 2, 1)], axis=1)
         self._chances = np.full(kinds, 1.0 / (kinds + 1))
+        seen = (self._weights > 0.0).sum(axis=1)
+        self._middle = np.stack([(seen - 1) // 2, seen // 2], axis=1)
         self._factors = self._weights / LEAST_SPREAD**2
         self._logs = np.zeros(3 * views)
         self._known = np.flatnonzero(self._weights.any(axis=0))
@@ -271,19 +273,20 @@ class _Solver:
 
         Then the chances of roughnesses and the weights are brought up to date.
         """
-        basis = self._basis * np.exp(self._logs)[None, :, None]
-        weighted = basis * self._factors[..., None]
-        precision = np.diag(np.full(basis.shape[2], 1e-9))
+        gains, basis = np.exp(self._logs), self._basis
+        weighted = basis * (self._factors * gains**2)[:, None]
+        precision = np.diag(np.full(basis.shape[1], 1e-9))
         precision[3:, 3:] = np.linalg.inv(
             np.diag(self._chances + LEAST_VARIANCE) - np.outer(self._chances, self._chances)
         )
-        spread = np.linalg.inv(weighted.transpose(0, 2, 1) @ basis + precision)
+        spread = np.linalg.inv(weighted @ basis.transpose(0, 2, 1) + precision)
         given = np.concatenate([np.zeros(3), precision[3:, 3:] @ self._chances])
-        found = spread @ (weighted.transpose(0, 2, 1) @ self._colors[..., None] + given[:, None])
-        model = (basis @ found)[..., 0]
+        found = spread @ (weighted @ (self._colors / gains)[..., None] + given[:, None])
+        plain = (found.transpose(0, 2, 1) @ basis)[:, 0]
+        model = plain * gains
         left = self._colors - model
-        explained = (weighted * model[..., None]) @ np.linalg.cholesky(spread)
-        rows = explained.transpose(0, 2, 1).reshape(-1, model.shape[1])
+        weighted *= plain[:, None]
+        rows = (np.linalg.cholesky(spread).transpose(0, 2, 1) @ weighted).reshape(-1, model.shape[1])
         matrix = np.diag((self._factors * model**2).sum(axis=0)) - rows.T @ rows
         right = (self._factors * model * left).sum(axis=0)
         self._learn(found[:, 3:, 0], left)
@@ -294,7 +297,8 @@ class _Solver:
         chances = np.maximum(found.mean(axis=0), LEAST_CHANCE)
         self._chances = chances / max(float(chances.sum()), 1.0)
         off = np.abs(left) * np.sqrt(self._weights)
-        middle = np.nanmedian(np.where(self._weights > 0.0, off, np.nan), axis=1, keepdims=True)
+        ordered = np.sort(np.where(self._weights > 0.0, off, np.inf), axis=1)
+        middle = 0.5 * np.take_along_axis(ordered, self._middle, axis=1).sum(axis=1, keepdims=True)
         deviation = np.maximum(1.4826 * middle, LEAST_SPREAD)
         self._factors = self._weights / (deviation**2 + off**2)
 

@@ -8,6 +8,7 @@ function. The device side of the mapping is `beam_warp.kernels.light.latlong`.
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -179,7 +180,8 @@ class EnvironmentMap:
         # azimuth from a normal's column to each source column; the first normal lies (stride - 1) / 2 columns in
         cosine = np.cos((np.arange(columns) - (stride - 1) / 2.0) * (2.0 * np.pi / columns))
         result = np.empty((height, width, 3), np.float32)
-        for row in range((height + 1) // 2):
+
+        def fill(row: int) -> None:
             polar = (row + 0.5) * (np.pi / height)
             kernel = np.maximum(np.sin(polar) * sideways[:, None] * cosine + np.cos(polar) * upward[:, None], 0.0)
             weights = np.fft.rfft(kernel, axis=1).conj().T[:, None, :]
@@ -187,6 +189,9 @@ class EnvironmentMap:
             for place, mirrored in ((row, weights), (height - 1 - row, weights[:, :, ::-1])):
                 product = np.matmul(mirrored, spectrum)[:, 0]
                 result[place] = np.fft.irfft(product, columns, axis=0)[::stride]
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(fill, range((height + 1) // 2)))
         return np.maximum(result, 0.0)  # a dark hemisphere is zero up to the rounding of the FFT
 
 

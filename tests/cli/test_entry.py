@@ -117,6 +117,15 @@ def test_a_damaged_exr_is_one_line(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_blas_has_one_thread_unless_the_user_says_otherwise(given, used):
+    script = "import os, sys; sys.argv[1:] = ['--version']; from beam_warp.cli import entry; assert 'numpy' not in "
+    script += "sys.modules; entry.beam(); print(os.environ['OPENBLAS_NUM_THREADS'])"
+    plain = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"} | given
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=plain, check=False)
+    assert done.stdout.split()[-1] == used, done.stderr
+
+
 def test_nobody_reads_the_output():
     command = [sys.executable, "-c", ENTRY.format("beam"), "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
