@@ -32,6 +32,9 @@ GAUSSIANS_PER_PIXEL = 4
 """Gaussians for a pixel that the subject covers in a reduced image, on each of its two sides: what is finer tells
 nothing there, and costs as much as at full resolution."""
 
+RATES_EVERY = 10
+"""Steps between two changes of the learning rates: a change is a launch of its own."""
+
 
 @dataclass(frozen=True)
 class JointPose:
@@ -189,8 +192,9 @@ class JointTracker:
         carried.carry(self._rotations, self._positions)
         targets.make_room(carried.drawn)
         for iteration, view in enumerate(order):
-            for name, rate in rates.items():
-                adam.set_learning_rate(name, rate * chosen.final_rate ** (iteration / len(order)))
+            if iteration % RATES_EVERY == 0:
+                for name, rate in rates.items():
+                    adam.set_learning_rate(name, rate * chosen.final_rate ** (iteration / len(order)))
             group, place = targets[int(view)]
             group.select(place)
             step = partial(self._step, carried, group, place, adam, chosen.rigidity / level**2)
