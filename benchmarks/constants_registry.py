@@ -24,6 +24,7 @@ EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 MASKED = "these captures have masks; it counts only for photographs without"
 EXACT_EXPOSURES = "exposures of these captures are equal, and colours stay as they are"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
+SCENE_LINEAR = "the captures are scene-linear, so that no exposure is looked for"
 FAR_MOTION = "only motion beyond the reach of reduced images uses it, which these frames do not have"
 NO_SCORE = "it decides what is reported, and moves no score"
 BINARY = "a list of powers of two"
@@ -309,9 +310,12 @@ MATERIALS = (
     Constant("beam_warp.materials.normals:ORIENTATION_RAYS", JUDGED, "Rays that find the open side.", NO_IMAGES),
     Constant("beam_warp.materials.normals:SMOOTHING_PASSES", JUDGED, "Rounds of smoothing normals.", NO_IMAGES),
     Constant("beam_warp.trace.rays:LIFT_IN_THICKNESSES", "tiled planes, spheres, bowls", "Lift of rays.", NO_IMAGES),
-    Constant("beam_warp.materials.exposure:BRIGHTEST", JUDGED, "Brightest base colour, and its quantile.", NO_IMAGES),
-    Constant("beam_warp.materials.exposure:MISFIT_SLACK", JUDGED, "Misfits that are equally good.", NO_IMAGES),
-    Constant("beam_warp.materials.exposure:WELL_LIT_PART", JUDGED, "Light of those that are asked.", NO_IMAGES),
+    Constant(
+        "beam_warp.materials.exposure:BRIGHTEST", JUDGED, "Brightest base colour, and its quantile.", SCENE_LINEAR
+    ),
+    Constant("beam_warp.materials.exposure:MISFIT_SLACK", JUDGED, "Misfits that are equally good.", SCENE_LINEAR),
+    Constant("beam_warp.materials.exposure:DOUBT", JUDGED, "Standard errors that are no evidence.", SCENE_LINEAR),
+    Constant("beam_warp.materials.exposure:WELL_LIT_PART", JUDGED, "Light of those that are asked.", SCENE_LINEAR),
     *(
         Constant(
             f"beam_warp.materials.changes:{name}", WALKER, does, "one frame is decomposed here; several are tested"

@@ -168,6 +168,7 @@ def _exposure_stops(frame: SeenFrame, light: PreparedEnvironment, options: RunOp
                     roughness,
                     light,
                     options=options.gathering,
+                    views=frame.views,
                     is_measured=frame.capture is not None and frame.capture.has_light,
                 )
             )

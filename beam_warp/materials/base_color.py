@@ -106,8 +106,12 @@ def solve_base_color(
     return BaseColor(base_color.astype(np.float32), error.astype(np.float32), flags, clipped)
 
 
-def least_squares(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def least_squares(
+    evidence: ColorEvidence, *, bounds: tuple[float, float] = (0.0, 1.0)
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the unbounded solution and its standard error, ``(N, 3)`` each; 0 where there is no evidence.
+
+    The error is that of the solution cut to ``bounds``: what is cut by them is a disagreement of all views with it.
 
     With v views of variance t^2 each, the variance of their mean is t^2 / v. What one Gaussian's views say of t^2 is
     joined with what is typical (the median over Gaussians), which counts for `POOLED_VIEWS` more views: an empirical
@@ -119,7 +123,7 @@ def least_squares(evidence: ColorEvidence) -> tuple[NDArray[np.float64], NDArray
     known = denominator > 0.0
     safe = np.where(known, denominator, 1.0)
     raw = np.where(known, numerator / safe, 0.0)
-    bounded = np.clip(raw, 0.0, 1.0)
+    bounded = np.clip(raw, *bounds)
     residual = np.maximum(observed - 2.0 * bounded * numerator + bounded**2 * denominator, 0.0)
     views = np.asarray(evidence.views, np.float64)[:, None]
     degrees = np.maximum(views - 1.0, 0.0)

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.materials.base_color import least_squares, misfit_error
 from beam_warp.materials.direct import measure_materials
+from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
@@ -19,6 +21,9 @@ BRIGHTEST = (0.95, 0.8)
 
 MISFIT_SLACK = 1e-2
 """Exposures whose misfit is within this part of the captured radiance of the least one count as equally good."""
+
+DOUBT = 2.0
+"""Standard errors by which a base colour must be beyond its bounds before it counts as impossible."""
 
 WELL_LIT_PART = 0.5
 """Gaussians that get at least this part of the mean irradiance have a say in the exposure."""
@@ -38,19 +43,24 @@ def estimate_exposure(
     light: PreparedEnvironment,
     *,
     options: MaterialOptions,
+    views: ViewEvidence | None = None,
     is_measured: bool = False,
 ) -> float:
     """Find the factor on an environment that makes display-referred captured colour physically plausible.
 
     Display-referred colour has no absolute scale, so base colour has none either; but it lies in [0, 1]. Too little
     light asks for more than 1, too much lets the specular lobe alone exceed what was captured. The factor is the one
-    whose bounds cut least of the captured radiance (in absolute
-    values: outliers must not decide); among those that are equally good, the one that gives the
-    brightest surfaces `BRIGHTEST`, or of a light that was measured, the one that changes it least: a subject without
-    white is no evidence against it.
+    whose bounds cut least of the captured radiance (in absolute values: outliers must not decide); among those that are
+    equally good, the one that gives the brightest surfaces `BRIGHTEST`, or of a light that was measured, the one that
+    changes it least: a subject without white is no evidence against it.
+
+    Nor is chance. Noise of the images, of the rays and of normals puts base colours of white surfaces above 1 as often
+    as below, and only a brighter light brings the former back. So what is cut counts from `DOUBT` standard errors of
+    each base colour on, as `beam_warp.materials.base_color` states them.
 
     For light s times the environment, sum w L_D (L_o - L_S) / s = A - s B: two measurements with the same rays give
-    A and B, and with them the base colour under every s.
+    A and B, and with them the base colour under every s. Its standard error is one of captured radiance over light, and
+    goes with 1 / s.
 
     Args:
         cloud: Gaussians with captured radiance.
@@ -59,6 +69,7 @@ def estimate_exposure(
         roughness: Their roughness.
         light: The light of the capture up to a factor.
         options: Rays, offset, seed; the bounce, which does not scale with the light, is left out.
+        views: What views with images show; None takes the captured radiance around each normal.
         is_measured: Whether the light is in the units of the capture as far as anybody knows.
 
     Returns:
@@ -68,7 +79,9 @@ def estimate_exposure(
     # Weights that depend on the light would make the sums more than linear in it.
     direct = replace(options, bounce=False, robust=False)
     full, half = (
-        measure_materials(cloud, scene, points, roughness, light.scaled(factor), options=direct, rows=rows).evidence
+        measure_materials(
+            cloud, scene, points, roughness, light.scaled(factor), options=direct, views=views, rows=rows
+        ).evidence
         for factor in (1.0, 0.5)
     )
     # Where the assumed light hardly reaches the quotient is arbitrary; such Gaussians have no say.
@@ -80,12 +93,14 @@ def estimate_exposure(
     captured = full.numerator[good] + specular
     denominator = full.denominator[good].astype(np.float64)
     weight = cloud.opacities[rows][good].astype(np.float64)
-    amplitude = weight[:, None] * np.sqrt(denominator)  # turns base colour into radiance
+    amplitude = weight[:, None] * full.irradiance[good]  # turns base colour into what is reflected
+    doubt = DOUBT * np.hypot(least_squares(full, bounds=(-np.inf, np.inf))[1], misfit_error(full))[good]
 
     misfit, brightest = [], []
     for factor in EXPOSURE_FACTORS:
         base_color = (captured - factor * specular) / (factor * denominator)
-        misfit.append(float((amplitude * factor * np.abs(base_color - np.clip(base_color, 0.0, 1.0))).sum()))
+        beyond = factor * np.abs(base_color - np.clip(base_color, 0.0, 1.0))
+        misfit.append(float((amplitude * np.maximum(beyond - doubt, 0.0)).sum()))
         largest = base_color.max(axis=1)
         order = np.argsort(largest)
         middle = np.searchsorted(np.cumsum(weight[order]), BRIGHTEST[0] * weight.sum())

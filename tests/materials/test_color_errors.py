@@ -45,6 +45,14 @@ class TestStandardError:
         assert np.sqrt((error**2).mean()) / (0.05 / np.sqrt(views)) == pytest.approx(1.0, abs=0.05)
         assert ((np.abs(raw - 0.5) < 2.0 * error).mean(0) > 0.90).all()  # Student's t of 2 degrees has 82 %
 
+    def test_views_that_agree_on_the_impossible_disagree_with_what_it_is_cut_to(self, rng):
+        """Views of 1.6, 0.05 off each: without bounds the error is that of their mean; cut to 1, they are 0.6 off."""
+        impossible = evidence(1.6 + rng.normal(0.0, 0.05, (8, 4000, 3)))
+        _, free = least_squares(impossible, bounds=(-np.inf, np.inf))
+        assert np.sqrt((free**2).mean()) == pytest.approx(0.05 / np.sqrt(8), rel=0.05)
+        _, cut = least_squares(impossible)
+        assert cut.min() > 0.5 / np.sqrt(8)
+
     def test_one_view_alone_is_as_uncertain_as_views_are_elsewhere(self, rng):
         """A single view has no residual; its error is what views typically differ by, not 0."""
         many = evidence(0.5 + rng.normal(0.0, 0.05, (16, 1000, 3)))

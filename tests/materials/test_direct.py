@@ -4,17 +4,21 @@ from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles
 
 from beam_warp import Scene, irradiance
+from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import solve_base_color
 from beam_warp.materials.direct import measure_materials
+from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.exposure import estimate_exposure
 from beam_warp.materials.light_rays import MaterialOptions, view_set
 from beam_warp.materials.normals import SurfaceNormals, SurfacePoints
+from beam_warp.world.directions import even_directions
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import Observability
 
@@ -232,6 +236,25 @@ class TestFailures:
         assert solved.base_color.shape == (0, 3)
 
 
+def seen_in_noise(points, shown, rng, *, noise):
+    """Eight views of a unit sphere in colours of its own, each with noise of its own over what it shows, on the CPU."""
+    directions, count = even_directions(8), len(points)
+    weights = np.maximum(directions @ points.T, 0.0)
+    colors = shown * (1.0 + noise * rng.normal(size=(8, count, 3)))
+    normals = upload(points.astype(np.float32), wp.vec3, "cpu")
+    return ViewEvidence(
+        positions=normals,
+        normals=normals,
+        agreement=wp.ones(count, dtype=float, device="cpu"),
+        weight=weights.sum(axis=0).astype(np.float32),
+        seen=np.ones(count, bool),
+        saturated=np.zeros(count, np.float32),
+        colors=upload(np.dstack([colors, weights]).astype(np.float32), wp.vec4, "cpu"),
+        directions=upload(np.repeat(directions[:, None], count, axis=1).astype(np.float32), wp.vec3, "cpu"),
+        misfit=np.zeros((count, 3), np.float32),
+    )
+
+
 class TestExposure:
     def found(self, truth, stops, **given):
         """Estimate the scale of a light that is some stops off, from a ball of greys [stop]."""
@@ -247,6 +270,18 @@ class TestExposure:
         """Whites of 0.8 and blacks of 0.05, captured at some exposure: the light comes back to a quarter stop."""
         truth = rng.choice([0.05, 0.3, 0.8], (1500, 1), p=[0.4, 0.4, 0.2])
         assert abs(self.found(truth, stops) + stops) < 0.25
+
+    @pytest.mark.parametrize(
+        ("stops", "expected"),
+        [(0.0, (0.0, 0.0)), (0.5, (0.0, 0.0)), (-1.0, (0.7, 1.0))],
+        ids=["right", "bright", "dim"],
+    )
+    def test_noise_is_no_evidence_against_a_measured_light(self, rng, stops, expected):
+        """White clothes, a third of which noise puts above 1 by chance; a light that is too dim is still found."""
+        points, _ = sphere_points(1500)
+        truth = rng.choice([0.5, 0.95], (1500, 1), p=[0.3, 0.7])
+        views = seen_in_noise(points, reflected(truth * np.ones(3), np.pi), rng, noise=0.2)
+        assert expected[0] <= self.found(truth, stops, views=views, is_measured=True) <= expected[1]
 
     @pytest.mark.parametrize(
         ("whites", "stops", "expected"),
