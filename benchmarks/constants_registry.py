@@ -166,6 +166,7 @@ RECONSTRUCTION = (
 
 TRACKING = (
     Constant(TRACK + "GAUSSIANS_PER_JOINT", WALKER, "Gaussians for each joint."),
+    Constant(JOINTS + "RATES_EVERY", JUDGED, "Steps between changes of the joints' rates."),
     Constant(JOINTS + "GAUSSIANS_PER_PIXEL", WALKER, "Gaussians for a pixel and side in reduced images."),
     Constant(TRACK + "JOINT_LIMITS", WALKER, "Fewest and most joints.", "neither limit is met with 20,000 Gaussians"),
     Constant(TRACK + "SMALLEST_COSINE", BOTH, "Cosine of normals below which neighbours are of two limbs.", most=1.0),
