@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+import gc
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import warp as wp
@@ -29,7 +31,19 @@ class StepGraphs:
             step()
             return
         if key not in self._graphs:
-            with wp.ScopedCapture(self._device) as capture:
+            with _garbage_kept(), wp.ScopedCapture(self._device) as capture:
                 step()
             self._graphs[key] = capture.graph
         wp.capture_launch(self._graphs[key])
+
+
+@contextmanager
+def _garbage_kept() -> Iterator[None]:
+    """Keep the garbage collector from freeing arrays on the device, which must not happen while a step is recorded."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()

@@ -1,5 +1,7 @@
 """Steps that are taken again: each call is one step, recorded or not, and what was recorded can be forgotten."""
 
+import gc
+
 import pytest
 import warp as wp
 
@@ -34,3 +36,11 @@ def test_every_call_is_one_step(device, rounds):
     graphs.clear()
     graphs.run(1, steps[10])  # another step under the same key
     assert array.numpy().tolist() == [11.0 * rounds + 10.0] * 5
+
+
+def test_nothing_is_freed_while_a_step_is_recorded(device):
+    """CUDA refuses to free an array then, and garbage is found at any time; elsewhere nothing is recorded."""
+    target, enabled = resolve_device(device), []
+    StepGraphs(target).run("step", lambda: enabled.append(gc.isenabled()))
+    assert enabled == [not target.is_cuda]
+    assert gc.isenabled()
