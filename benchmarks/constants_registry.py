@@ -102,7 +102,6 @@ RECONSTRUCTION = (
     Constant(FIT + "FitOptions.rates.final_positions", "3DGS", "Part of the positions' step at the end.", most=1.0),
     Constant(FIT + "FitOptions.rates.final_others", WALKER, "Part of all other steps at the end.", most=1.0),
     Constant(FIT + "FitOptions.sh_degree", WALKER, "Degree of the captured radiance."),
-    Constant(FIT + "FitOptions.open_bands", "walker, runner, robot", "Part of all steps before finer bands.", most=1.0),
     Constant(FIT + "FitOptions.raster.low_pass", WALKER, "Variance of the pixel filter [pixel²]."),
     Constant(FIT + "FitOptions.refine_every", WALKER, "Steps between refinements."),
     Constant(FIT + "FitOptions.refine_until", WALKER, "Part of all steps after which none is refined.", most=1.0),
@@ -558,7 +557,7 @@ UNTUNED = {
     "not used, or another option's": """
         FitOptions: raster.near temporal
         TrackOptions: joints.weights.normal
-        TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.open_bands refinement.seed
+        TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every
         TrackOptions: refinement.refine_until refinement.split_fraction refinement.hidden_share refinement.dead_opacity
         BakeOptions: passes ridge temporal low high""",

@@ -109,8 +109,6 @@ class FitOptions:
         weights: Weights of the terms.
         rates: Sizes of steps.
         sh_degree: Degree of the captured radiance.
-        open_bands: Part of all steps before which bands from the second on stay: colour that changes with the direction
-            at will takes the place of shape.
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see `sample_side`.
         raster: How splats are drawn.
         sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
@@ -134,7 +132,6 @@ class FitOptions:
     weights: LossWeights = field(default_factory=lambda: LossWeights(normal=5.0, normal_tolerance=0.02))
     rates: LearningRates = field(default_factory=LearningRates)
     sh_degree: int = 2
-    open_bands: float = 0.5
     samples: int | Literal["auto"] = "auto"
     raster: RasterOptions = FIT_RASTER
     sampling_filter: bool = True
@@ -156,7 +153,7 @@ class FitOptions:
         require_count("sh_degree", self.sh_degree, 0, 4)
         if self.samples != "auto":
             require_count("samples", self.samples, 1, 8)
-        for name in ("open_bands", "refine_until", "split_fraction", "hidden_share", "dead_opacity"):
+        for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
             require_number(name, getattr(self, name), 0.0, 1.0)
         require_number("temporal", self.temporal, 0.0)
 
@@ -174,7 +171,7 @@ class FitOptions:
         """
         require_choice("preset", preset, PRESETS)
         rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
-        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "open_bands": 0.0, "split_fraction": 0.05}
+        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
             "draft": {
@@ -329,7 +326,6 @@ class Fitter:
             "log_scales": rates.scales,
             "logits": rates.opacities,
             "color": rates.color,
-            "first_band": rates.bands,
             "bands": rates.bands,
         }
         self._adam: Adam = self.parameters.optimizer(self._rates)
@@ -413,8 +409,7 @@ class Fitter:
         rates = self.options.rates
         for name in self._adam.parameters:
             final = rates.final_positions if name == "positions" else rates.final_others
-            is_open = name != "bands" or part >= self.options.open_bands
-            self._adam.set_learning_rate(name, self._rates[name] * final**part * is_open)
+            self._adam.set_learning_rate(name, self._rates[name] * final**part)
 
     def _renew(self) -> float:
         """Bring the sampling filter and the room for pairs up to date; return the mean PSNR of the views [dB]."""

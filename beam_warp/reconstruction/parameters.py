@@ -129,8 +129,8 @@ class GaussianParameters:
         """Return an optimiser of the rows.
 
         Args:
-            rates: Learning rates of ``positions``, ``orientations``, ``log_scales``, ``logits``, ``color`` (band 0),
-                ``first_band`` and ``bands`` (from the second on, if there are any); those left out stay.
+            rates: Learning rates of ``positions``, ``orientations``, ``log_scales``, ``logits``, ``color`` (band 0)
+                and ``bands`` (all others, if there are any); those left out stay.
 
         Raises:
             InvalidOptionError: There is no such group.
@@ -138,11 +138,10 @@ class GaussianParameters:
         color, slope = float_rows(self.radiance), float_rows(self._gradients["radiance"])
         groups = {name: (getattr(self, name), self._gradients[name]) for name in self._gradients if name != "radiance"}
         groups["color"] = (color[:, :3], slope[:, :3])
-        for name, part in (("first_band", slice(3, 12)), ("bands", slice(12, None))):
-            if color.shape[1] > part.start:
-                groups[name] = (color[:, part], slope[:, part])
+        if color.shape[1] > 3:
+            groups["bands"] = (color[:, 3:], slope[:, 3:])
         for name in rates:
-            require_choice("rates", name, (*groups, "first_band", "bands"))
+            require_choice("rates", name, (*groups, "bands"))
         return Adam({name: Parameters(*groups[name], rate) for name, rate in rates.items() if name in groups})
 
     def rows(self) -> dict[str, Any]:

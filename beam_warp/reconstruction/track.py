@@ -73,7 +73,6 @@ class TrackOptions:
         default_factory=lambda: FitOptions(
             color_iterations=0,
             normal_iterations=400,
-            open_bands=0.0,
             rates=LearningRates(1e-4, 1e-3, 2e-3, 1e-2, 5e-3, 2.5e-4, final_positions=0.1, final_others=1.0),
             temporal=1e-3,
         )

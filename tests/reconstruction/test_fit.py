@@ -79,17 +79,6 @@ class TestProgress:
         np.testing.assert_array_equal(fit.cloud.positions, start.positions)
         assert fit.report["iterations"] == 0
 
-    def test_bands_from_the_second_on_wait(self, device, views):
-        """Half of the steps have gone by when rates are set for the second time."""
-        shown = {}
-        for opens in (0.0, 0.5, 1.0):
-            fitter = fitter_of(views, ball_cloud(40), few_steps(normal_iterations=100, open_bands=opens), device)
-            radiance = []
-            fitter.run(lambda *_, kept=radiance, of=fitter.parameters: kept.append(of.radiance.numpy().copy()))
-            shown[opens] = [bool(part[:, 4:].any()) for part in radiance]
-            assert all(part[:, 1:4].any() for part in radiance[1:])
-        assert shown == {0.0: [False, True, True], 0.5: [False, False, True], 1.0: [False, False, False]}
-
     def test_positions_come_to_rest(self, device, views):
         """Late steps move them far less than early ones, with a last rate far below the first."""
         rates = LearningRates(1e-3, 1e-7, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -263,7 +252,7 @@ OUT_OF_RANGE = {
         "sh_degree": (-1, 5),
         "samples": (0, 9, "many", None),
         "temporal": (-0.1, np.nan),
-        **dict.fromkeys(("open_bands", "refine_until", "split_fraction", "hidden_share", "dead_opacity"), (-0.1, 1.1, np.nan)),
+        **dict.fromkeys(("refine_until", "split_fraction", "hidden_share", "dead_opacity"), (-0.1, 1.1, np.nan)),
     },
     LearningRates: dict.fromkeys(
         ("positions", "final_positions", "orientations", "scales", "color", "bands"), (-0.1, np.nan, "fast")
