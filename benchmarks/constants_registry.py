@@ -393,6 +393,7 @@ MATERIALS = (
         Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, EXACT_RIGS)
         for name, does in (
             ("CERTAIN", "Corrections of a rig that are made [standard error]."),
+            ("LEAST_DISTORTION", "Distortion of lenses that is told [pixel]."),
             ("CERTAIN_ALONE", "Those of one camera alone [standard error]."),
             ("MOST_BEHIND", "How much worse a camera that is left out is met [dB]."),
             ("ALIKE", "Quality of a photograph that is not left out [dB]."),

@@ -15,7 +15,7 @@ from beam_warp.reconstruction.alignment import Evidence, flow_of
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.labels import agreement_of
-from beam_warp.reconstruction.rig import distortion_of, in_gauge, pixels_of, refine_rig, wrong_kinds
+from beam_warp.reconstruction.rig import LEAST_DISTORTION, distortion_of, in_gauge, pixels_of, refine_rig, wrong_kinds
 
 POSE = ("turn", "shift")
 
@@ -113,6 +113,8 @@ def test_lenses_that_nobody_states_are_told_by_their_size(rng, points):
     truth[:, 9] = np.where(np.arange(12) % 2, 0.2, -0.2)
     size = np.sqrt(np.mean(np.square(apart(cameras, truth, points))))
     assert distortion_of(cameras, says(rng, points, truth, 0.1), points) == pytest.approx(size, rel=0.2)
+    little = 0.4 * LEAST_DISTORTION / size * truth
+    assert distortion_of(cameras, says(rng, points, little, 1e-3), points) == 0.0  # sure, and nothing to speak of
     said = RigCorrection((), is_applied=False, confidence=1.0, distortion=0.3)
     assert [finding.code for finding in said.findings()] == ["lens-distortion"]
     assert RigCorrection.from_dict(said.as_dict()) == said
