@@ -20,18 +20,26 @@ Key = tuple[str, str, float]
 """Capture, name of the flaw, size."""
 
 
-@table("flaws", "flaws_h200.json")
-def flaws(result: Row) -> Rows:
+@table("flaws_studio", "flaws_studio_h200.json")
+def scores(result: Row) -> Rows:
     """Return a row for every flaw and size of every capture, means over seeds: the clean ones first, then the worst."""
     head = ["what is wrong", "ambient occlusion", "base colour, scaled", "its scale", "relit, scaled", "novel views"]
     head += ["normals", "depth [mm]", "roughness", "named"]
     return [head, *(_cells(label, rows) for label, rows in _groups(result))]
 
 
-@table("flaws_studio", "flaws_studio_h200.json")
-def studio(result: Row) -> Rows:
-    """Return the scores of clean captures and of those with all of a studio's flaws, means over seeds."""
-    return flaws(result)
+@table("flaws_alone", "flaws_studio_h200.json", "flaws_alone_h200.json")
+def alone(together: Row, result: Row) -> Rows:
+    """Return the scores of clean captures, and of those with one of a studio's flaws."""
+    clean = [row for row in together["rows"] if row["case"]["flaw"] == "clean"]
+    return scores({"rows": [*clean, *result["rows"]]})
+
+
+@table("flaws_others", "flaws_h200.json", "flaws_alone_h200.json")
+def others(result: Row, newer: Row) -> Rows:
+    """Return the scores of clean captures and of those with flaws that were not measured since."""
+    known = {"flawed", *(row["case"]["flaw"] for row in newer["rows"])}
+    return scores({"rows": [row for row in result["rows"] if row["case"]["flaw"] not in known]})
 
 
 @table("flaws_mended", "flaws_studio_h200.json")

@@ -33,6 +33,7 @@ def sizes(result: Row) -> Rows:
 
 
 @table("reduce_certified", REDUCE)
+@table("reduce_certified_now", "reduce_robot_h200.json")
 def certified(result: Row) -> Rows:
     """Return whole calls: seconds, what they state, and what fresh draws say."""
     rows: list[list[Any]] = [["asset", "asked", "Gaussians", "seconds", "bound [dB]", "stated for", "held in"]]

@@ -98,8 +98,8 @@ def workers(result: Row) -> Rows:
     return rows
 
 
-@table("scale_start", "start_cpu.json")
-def start(result: Row) -> Rows:
+@table("scale_start", "start_cpu.json", "workers_start_h200.json")
+def start(on_cpu: Row, on_gpu: Row) -> Rows:
     """Return how long a tiny take needs until its first step begins, and in all."""
     parts = {
         "before": "until the first step [s]",
@@ -108,8 +108,12 @@ def start(result: Row) -> Rows:
         "whole": "all [s]",
     }
     return [
-        ["workers", *parts.values()],
-        *([row["workers"], *(cell(row[name], ".1f") for name in parts)] for row in result["start"]["rows"]),
+        ["on", "workers", *parts.values()],
+        *(
+            [device, row["workers"], *(cell(row[name], ".1f") for name in parts)]
+            for device, result in (("two CPU cores", on_cpu), ("an H200", on_gpu))
+            for row in result["start"]["rows"]
+        ),
     ]
 
 
