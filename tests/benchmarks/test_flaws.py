@@ -52,7 +52,7 @@ def test_several_flaws_have_a_row_of_few_words():
         {"case": {"capture": capture, "flaw": flaw, "size": 1.0}, "scores": scores, "named": {}, "beside": []}
         for capture, flaw in cases
     ]
-    labels = [row[0] for row in tables_flaws.flaws({"rows": rows})[1:]]
+    labels = [row[0] for row in tables_flaws.scores({"rows": rows})[1:]]
     assert labels == [FLAWS["masks"], "noise, masks and poses at once"]
 
 
@@ -154,10 +154,15 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
 
     rows = [row("noise", 29.0), row("clean", 30.0, beside=["few-cameras in frame 0"])]
     rows += [row("masks", 20.0 + 2 * seed, seed, named={"masks": bool(seed)}) for seed in (0, 1)]
-    head, *body = tables_flaws.flaws({"rows": rows})
+    head, *body = tables_flaws.scores({"rows": rows})
     assert {len(cells) for cells in body} == {len(head)}
     assert [cells[1] for cells in body] == ["30.0 dB / 0.900", "21.0 dB / 0.900", "29.0 dB / 0.900"]
     assert [cells[-1] for cells in body] == ["also `few-cameras`", "masks in 1 of 2 runs", ""]
+    together = {"rows": [row("clean", 31.0), row("flawed", 25.0)]}
+    _, *alone = tables_flaws.alone(together, {"rows": [row("noise", 29.0)]})
+    assert [cells[1] for cells in alone] == ["31.0 dB / 0.900", "29.0 dB / 0.900"]
+    _, *others = tables_flaws.others({"rows": [*rows, row("flawed", 25.0)]}, {"rows": [row("noise", 29.0)]})
+    assert [cells[1] for cells in others] == ["30.0 dB / 0.900", "21.0 dB / 0.900"]
     _, first, *_ = tables_flaws.recovered({"rows": rows})
     assert first == ["nothing", "+0.50", "-0.25", "0.10", "0.20", *["60 %, 90 %"] * 3, "7"]
 
@@ -165,7 +170,7 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
 def test_what_was_refused_has_a_row():
     case = {"capture": "walker", "flaw": "masks", "size": 2.0, "seed": 0}
     rows = [{"case": case, "refused": "no", "named": {"masks": False}, "beside": []}]
-    for make in (tables_flaws.flaws, tables_flaws.recovered):
+    for make in (tables_flaws.scores, tables_flaws.recovered):
         head, cells = make({"rows": rows})
         assert len(cells) == len(head)
         assert cells[0].endswith("twice that")
