@@ -359,6 +359,7 @@ MATERIALS = (
             ("LEAST_CHANCE", "Least probability of a roughness."),
             ("LEAST_SPREAD", "Least standard deviation of a colour."),
             ("FIT_GAUSSIANS", "Gaussians of the surface at which views are compared."),
+            ("MODEL_ERROR", "Error of exposures that halves of the points share [logarithm]."),
         )
     ),
     *(

@@ -7,7 +7,15 @@ from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS
 from beam_warp.reconstruction import photometry
 from beam_warp.reconstruction.fit import Fit, FitOptions
-from beam_warp.reconstruction.photometry import LEVELS, find_exposures, highlights, judged, solve_gains
+from beam_warp.reconstruction.photometry import (
+    LEVELS,
+    MODEL_ERROR,
+    SolvedGains,
+    find_exposures,
+    highlights,
+    judged,
+    solve_gains,
+)
 from beam_warp.world.environment import EnvironmentMap
 
 VIEWS, POINTS = 12, 600
@@ -83,6 +91,16 @@ def test_sound_views_stay_to_the_bit(lit):
     found = judged([str(view) for view in range(VIEWS)], solved)
     assert (found.exposure_undone, found.balance_undone) == (False, False)
     assert {camera.gains for camera in found.cameras} == {(1.0, 1.0, 1.0)}
+
+
+@pytest.mark.parametrize(("size", "is_undone"), [(1.3, False), (4.0, True)])
+def test_what_a_wrong_surface_shows_is_no_exposure(rng, size, is_undone):
+    """Halves of the points agree on it, however many there are: only what is larger by far is undone, and all of it."""
+    logs = drawn_gains(rng, 1.0, 0.0)
+    logs *= size * MODEL_ERROR / np.sqrt(np.mean(np.square(logs)))
+    found = judged([str(view) for view in range(VIEWS)], SolvedGains(logs, np.zeros_like(logs), np.zeros_like(logs)))
+    assert found.exposure_undone == is_undone
+    np.testing.assert_allclose(np.log([camera.gains for camera in found.cameras]), is_undone * logs, atol=1e-12)
 
 
 def test_each_is_judged_by_its_own_evidence(lit, rng):
