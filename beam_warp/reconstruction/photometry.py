@@ -67,8 +67,8 @@ CHANCE = 1e-3
 """Probability below which differences of gains are not chance."""
 
 MODEL_ERROR = 0.015
-"""Error of the logarithms of exposures that halves of the points share, because the surface is wrong: cameras of walker,
-runner and robot, whose exposures are equal, seem to differ by 0.008, 0.019 and 0.027 (root mean square)."""
+"""Error of the logarithms of exposures that halves of the points share, because the surface is wrong: cameras of
+walker, runner and robot, whose exposures are equal, seem to differ by 0.008, 0.019 and 0.027 (root mean square)."""
 
 MOST_POINTS = 1_024
 """Most points that are compared, evenly chosen."""
