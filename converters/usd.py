@@ -17,9 +17,6 @@ from beam_warp.schema.writer import WrittenClips, write_asset
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 
-FEW_FRAMES = 8
-"""Frames of a sequence that is kept in memory while it is written, at most; a longer one is read twice."""
-
 
 def read(path: Path, options: ReadOptions) -> GaussianSequence:
     """Read an asset; axes and units that the caller states outrank those of the stage, with a note."""
@@ -74,8 +71,7 @@ def prepared(sequence: GaussianSequence, sh_degree: int | None = None) -> Gaussi
     """Return a sequence as it is written: y up, with radiance of a degree."""
     axes = IMPORTERS["usd"].axes
 
-    # A writer asks for every frame twice, and more often for the first.
-    @lru_cache(maxsize=len(sequence) if len(sequence) <= FEW_FRAMES else 1)
+    @lru_cache(maxsize=1)  # a writer asks for the first frame more than once
     def read(frame: int) -> GaussianCloud:
         cloud = change_axes(sequence[frame], axes)
         if cloud.radiance is None or sh_degree is None:
