@@ -99,8 +99,7 @@ FEWER_POINTS = 23
 """Every so many Gaussians are asked how far they move in an image: hundreds do."""
 
 LEAST_DISTORTION = 0.05
-"""Distortion from which on it is told [pixel]: what is less costs a fit nothing that could be measured, and fits of few
-Gaussians seem to show 0.03 of the exact pinholes of walker."""
+"""Distortion from which on it is told [pixel]: fits of few Gaussians show 0.03 of walker, whose pinholes are exact."""
 
 MOVED_KINDS = ("turn", "focal", "shift", "center")
 """Kinds of numbers that are moved where the photographs say so, most likely first."""

@@ -2,13 +2,13 @@
 
 import json
 import zipfile
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from beam_warp import converters
-from beam_warp.converters import WriteOptions, usd
+from beam_warp.converters import WriteOptions
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError, MissingFileError, OutputError
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianSequence
@@ -133,14 +133,6 @@ def test_usd_gets_y_up_metres_and_the_asked_bands(make_cloud, tmp_path):
     assert np.array_equal(back[0].scales, cloud.scales)  # in full float
     assert back.metadata["producer"] == "somebody"
     assert "notes" not in back.metadata
-
-
-@pytest.mark.parametrize("frames", [usd.FEW_FRAMES, usd.FEW_FRAMES + 1])
-def test_a_short_sequence_is_read_once_and_of_a_long_one_a_frame_is_kept(frames, walk, tmp_path):
-    asked = []
-    read = replace(walk, frame_count=frames, read_frame=lambda frame: asked.append(frame) or walk[frame])
-    converters.write(read, tmp_path / "walk.usda")
-    assert sorted(asked) == sorted([*range(frames)] * (1 if frames <= usd.FEW_FRAMES else 2))
 
 
 def test_what_the_caller_states_outranks_a_stage_with_a_note(make_cloud, tmp_path, trusted_files):
