@@ -14,8 +14,11 @@ from beam_warp.checks import require_number
 from beam_warp.device.arrays import upload
 from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.neighborhoods import (
+    FaceRule,
     launch_consult_neighbors,
+    launch_judge_faces,
     launch_mean_of_face,
+    launch_take_faces,
     launch_thinnest_direction,
 )
 from beam_warp.materials.evidence import ViewEvidence
@@ -44,6 +47,22 @@ FACE_SPREAD = 0.2
 edge of 40 degrees lets next to nothing through."""
 
 FACE_PASSES = 2
+
+FACE_NEIGHBORS = 32
+"""Neighbours among which a Gaussian looks for the face that it lies on: two rings and a half."""
+
+FLAT_SPREAD = 0.05
+LEAST_FLAT = 0.4
+"""Standard deviation of normals within a flat face [rad], and the part of a neighbourhood that must differ by no more.
+Bodies and cloth are hardly ever as flat: their normals stay."""
+
+FACE_AROUND = 1.1
+FACE_REACH = 1.6
+OFF_PLANE = 0.16
+"""Standard deviations of a neighbourhood, of the distance to a face, and of places about its plane [spacing]."""
+
+FACE_TURN = 0.35
+"""Standard deviation of how much the normal of a Gaussian turns [rad] as it takes that of a face."""
 
 LEAST_TOWARDS = 0.7
 """Cosine to the normal that pixels see from which on a Gaussian's own axis can be that of the surface there: a
@@ -124,7 +143,7 @@ class SurfacePoints:
         device = scene.device
         agreement = evidence.agreement.numpy()
         rows = np.flatnonzero(evidence.seen)
-        near = _neighbors(evidence.positions.numpy()[rows], device)
+        near = _neighbors(evidence.positions.numpy()[rows], device, FACE_NEIGHBORS)
         # What views hardly show of a neighbour is hidden by others: it says little of the face.
         weights = upload((cloud.opacities * np.minimum(evidence.weight, 1.0))[rows].astype(np.float32), float, device)
         places = upload(evidence.positions.numpy()[rows], wp.vec3, device)
@@ -221,12 +240,12 @@ def _facing(cloud: GaussianCloud, evidence: ViewEvidence, normals: NDArray[np.fl
     return facing
 
 
-def _neighbors(places: NDArray[np.float32], device: wp.Device) -> wp.array:
-    """Return the rows of the nearest places, the own one first, ``(N, K)`` int."""
+def _neighbors(places: NDArray[np.float32], device: wp.Device, most: int = NEIGHBOR_COUNT) -> wp.array:
+    """Return the rows of the nearest places, the own one first, ``(N, K)`` int with K at most ``most + 1``."""
     count = len(places)
     if count == 0:
         return wp.zeros((0, 1), dtype=int, device=device)
-    found = cKDTree(places).query(places, k=min(NEIGHBOR_COUNT + 1, count), workers=-1)[1]
+    found = cKDTree(places).query(places, k=min(most + 1, count), workers=-1)[1]
     return upload(found.reshape(count, -1).astype(np.int32), int, device)
 
 
@@ -243,6 +262,7 @@ def _face_normals(
     What pixels see is a blend of the Gaussians in them, and spread back it is blended once more: edges are rounded
     by two pixels. A flat Gaussian's own axis is not blended, but it is noisy; so it is averaged over its face. Where
     pixels agree with the face, to within the noise of the axes, there is no edge, and they know the normal better.
+    Last, what lies in the plane of a flat face takes its normal: rounded edges between flat faces become crisp.
     """
     device = near.device
     own, flatness = _shortest_axes(cloud.select(rows))
@@ -251,13 +271,22 @@ def _face_normals(
     is_own = (flatness > 1.0 - FLAT_RATIO) & (np.abs(towards) > LEAST_TOWARDS)
     outward = own * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     current = upload(np.where(is_own[:, None], outward, blended).astype(np.float32), wp.vec3, device)
-    following = wp.empty_like(current)
+    following, ring = wp.empty_like(current), near[:, : NEIGHBOR_COUNT + 1]
     for _ in range(FACE_PASSES):
-        launch_mean_of_face(len(current), places, current, weights, near, FACE_SPREAD, following, device)
+        launch_mean_of_face(len(current), places, current, weights, ring, FACE_SPREAD, following, device)
         current, following = following, current
     faces = current.numpy()
     agrees = (faces * blended).sum(axis=1) > np.cos(0.5 * FACE_SPREAD)
-    return np.where(agrees[:, None], blended, faces)
+    current = upload(np.where(agrees[:, None], blended, faces), wp.vec3, device)
+    support, flatness = (wp.empty(len(current), dtype=float, device=device) for _ in range(2))
+    rule = FaceRule()
+    rule.spread, rule.flat_spread, rule.least_flat = FACE_SPREAD, FLAT_SPREAD, LEAST_FLAT
+    rule.around, rule.reach, rule.off_plane, rule.turn = FACE_AROUND, FACE_REACH, OFF_PLANE, FACE_TURN
+    for _ in range(FACE_PASSES):
+        launch_judge_faces(len(current), places, current, weights, near, rule, support, flatness, device)
+        launch_take_faces(len(current), places, current, weights, near, support, flatness, rule, following, device)
+        current, following = following, current
+    return current.numpy()
 
 
 def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -1,4 +1,4 @@
-"""Surface around each Gaussian from its neighbours: their thinnest direction, and the normal that they agree on."""
+"""Surface around each Gaussian from its neighbours: their thinnest direction, the normal that they agree on, its face."""
 
 import warp as wp
 
@@ -131,6 +131,118 @@ def mean_of_face_kernel(
     out_normals[i] = own
 
 
+@wp.struct
+class FaceRule:
+    """When a Gaussian takes the normal of a flat face beside it.
+
+    Attributes:
+        spread: Standard deviation of normals that belong to one face [rad].
+        flat_spread: Standard deviation of normals within a flat face [rad].
+        least_flat: Part of the neighbourhood that must differ by no more, for a face to be flat.
+        around: Standard deviation of a neighbourhood [spacing].
+        reach: Standard deviation of the distance to such a face [spacing].
+        off_plane: Standard deviation of places about its plane [spacing].
+        turn: Standard deviation of how much normals turn [rad].
+    """
+
+    spread: float
+    flat_spread: float
+    least_flat: float
+    around: float
+    reach: float
+    off_plane: float
+    turn: float
+
+
+@wp.func
+def bell(distance: float, deviation: float) -> float:
+    part = distance / deviation
+    return wp.exp(-0.5 * part * part)
+
+
+@wp.func
+def spacing_at(i: int, points: wp.array[wp.vec3], neighbors: wp.array2d[int]) -> float:
+    """Distance to the eighth neighbour: a ring around a point."""
+    last = wp.min(8, neighbors.shape[1] - 1)
+    return wp.max(wp.length(points[neighbors[i, last]] - points[i]), 1.0e-12)
+
+
+@wp.kernel
+def judge_faces_kernel(
+    first: int,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    weights: wp.array[float],
+    neighbors: wp.array2d[int],
+    rule: FaceRule,
+    out_support: wp.array[float],
+    out_flatness: wp.array[float],
+):
+    """Find which part of the surface around a point has its normal: about, and as exactly as a flat face has."""
+    i = first + wp.tid()
+    reach = rule.around * spacing_at(i, points, neighbors)
+    total = float(1.0e-12)
+    alike = float(0.0)
+    flat = float(0.0)
+    for k in range(neighbors.shape[1]):
+        j = neighbors[i, k]
+        weight = weights[j] * bell(wp.length(points[j] - points[i]), reach)
+        difference = wp.length(normals[j] - normals[i])
+        total += weight
+        alike += weight * bell(difference, rule.spread)
+        flat += weight * bell(difference, rule.flat_spread)
+    out_support[i] = alike / total
+    out_flatness[i] = flat / total
+
+
+@wp.func
+def speaks_for(
+    offset: wp.vec3, own: wp.vec3, normal: wp.vec3, support: float, spacing: float, rule: FaceRule
+) -> float:
+    """How likely a point belongs to the face of a neighbour: how much of the surface there has its normal, how near it
+    is, how near the point is to its plane, and how little the normal would turn."""
+    near = bell(wp.length(offset), rule.reach * spacing) * bell(wp.dot(offset, normal), rule.off_plane * spacing)
+    return support * support * near * bell(wp.length(normal - own), rule.turn)
+
+
+@wp.kernel
+def take_faces_kernel(
+    first: int,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    weights: wp.array[float],
+    neighbors: wp.array2d[int],
+    support: wp.array[float],
+    flatness: wp.array[float],
+    rule: FaceRule,
+    out_normals: wp.array[wp.vec3],
+):
+    """Give a point the normal of the face in whose plane it lies, if that face is flat.
+
+    Each neighbour stands for the face around it; the result is the mean of those that stand for the same face as the
+    likeliest one.
+    """
+    i = first + wp.tid()
+    spacing = spacing_at(i, points, neighbors)
+    own = normals[i]
+    best = int(i)
+    most = float(0.0)
+    for k in range(neighbors.shape[1]):
+        j = neighbors[i, k]
+        speaks = speaks_for(points[i] - points[j], own, normals[j], support[j], spacing, rule)
+        if speaks > most:
+            most = speaks
+            best = j
+    total = wp.vec3()
+    for k in range(neighbors.shape[1]):
+        j = neighbors[i, k]
+        speaks = speaks_for(points[i] - points[j], own, normals[j], support[j], spacing, rule)
+        total += normals[j] * (weights[j] * speaks * bell(wp.length(normals[j] - normals[best]), rule.spread))
+    if flatness[best] > rule.least_flat and wp.length(total) > 1.0e-12:
+        own = wp.normalize(total)
+    out_normals[i] = own
+
+
 launch_thinnest_direction = launcher(thinnest_direction_kernel)
 """Analyse every Gaussian's neighbourhood: in ``neighbors``, column 0 is the Gaussian itself."""
 
@@ -141,3 +253,11 @@ launch_consult_neighbors = launcher(consult_neighbors_kernel)
 
 launch_mean_of_face = launcher(mean_of_face_kernel)
 """Do one pass of smoothing that edges stop."""
+
+
+launch_judge_faces = launcher(judge_faces_kernel)
+"""Judge how flat the surface around every point is."""
+
+
+launch_take_faces = launcher(take_faces_kernel)
+"""Do one pass in which points take the normals of flat faces."""
