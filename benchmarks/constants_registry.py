@@ -15,6 +15,7 @@ from constants_places import scaled
 
 WALKER = "walker"
 BOTH = "walker, runner"
+ALL = "walker, runner, robot"
 JUDGED = "by judgement"
 
 NO_IMAGES = "the captures have images; it counts only for Gaussians without"
@@ -91,8 +92,8 @@ RECONSTRUCTION = (
     Constant(FIT + "FitOptions.weights.l1", "3DGS", "Weight of colour.", "only its ratio to the others counts"),
     Constant(FIT + "FitOptions.weights.ssim", "3DGS", "Weight of structural similarity."),
     Constant(FIT + "FitOptions.weights.alpha", WALKER, "Weight of coverage."),
-    Constant(FIT + "FitOptions.weights.normal", "walker, runner, robot", "Weight of normals against the depth's."),
-    Constant(FIT + "FitOptions.weights.normal_tolerance", "walker, runner, robot", "Angle of an edge [rad]."),
+    Constant(FIT + "FitOptions.weights.normal", ALL, "Weight of normals against the depth's."),
+    Constant(FIT + "FitOptions.weights.normal_tolerance", ALL, "Angle of an edge [rad]."),
     Constant(FIT + "FitOptions.rates.positions", WALKER, "Step of positions, in distances of the cameras."),
     Constant(FIT + "FitOptions.rates.orientations", WALKER, "Step of orientations."),
     Constant(FIT + "FitOptions.rates.scales", WALKER, "Step of the logarithms of scales."),
@@ -250,6 +251,13 @@ MATERIALS = (
     Constant("beam_warp.materials.normals:LAYER_REACH", JUDGED, "How far from the surface a Gaussian is of a layer."),
     Constant("beam_warp.materials.normals:FACE_SPREAD", BOTH, "Normals of one face, beside an edge [rad]."),
     Constant("beam_warp.materials.normals:FACE_PASSES", BOTH, "Rounds of averaging over a face."),
+    Constant("beam_warp.materials.normals:FACE_NEIGHBORS", ALL, "Neighbours among which faces are looked for."),
+    Constant("beam_warp.materials.normals:FLAT_SPREAD", ALL, "Normals within a flat face [rad]."),
+    Constant("beam_warp.materials.normals:LEAST_FLAT", ALL, "Part of a neighbourhood that must be as flat."),
+    Constant("beam_warp.materials.normals:FACE_AROUND", ALL, "Width of a neighbourhood [spacing]."),
+    Constant("beam_warp.materials.normals:FACE_REACH", ALL, "Distance to a face whose normal is taken [spacing]."),
+    Constant("beam_warp.materials.normals:OFF_PLANE", ALL, "Distance from its plane [spacing]."),
+    Constant("beam_warp.materials.normals:FACE_TURN", ALL, "How far a normal turns to that of a face [rad]."),
     Constant("beam_warp.materials.normals:LEAST_TOWARDS", JUDGED, "An own axis that faces as pixels see."),
     Constant(EVIDENCE + "LEAST_WEIGHT", BOTH, "Pixels that must show a Gaussian for it to be seen."),
     Constant(EVIDENCE + "LEAST_SHARE", BOTH, "Part of its own pixels that they must be."),
@@ -351,7 +359,7 @@ MATERIALS = (
         )
     ),
     *(
-        Constant(f"beam_warp.reconstruction.photometry:{name}", "walker, runner, robot", does, EXACT_EXPOSURES)
+        Constant(f"beam_warp.reconstruction.photometry:{name}", ALL, does, EXACT_EXPOSURES)
         for name, does in (
             ("LEVELS", "Levels of roughness whose highlights explain those of all others."),
             ("NEIGHBORS", "Gaussians over which normals are averaged."),
@@ -391,7 +399,7 @@ MATERIALS = (
         )
     ),
     *(
-        Constant(f"beam_warp.reconstruction.rig:{name}", "walker, runner, robot", does, EXACT_RIGS)
+        Constant(f"beam_warp.reconstruction.rig:{name}", ALL, does, EXACT_RIGS)
         for name, does in (
             ("CERTAIN", "Corrections of a rig that are made [standard error]."),
             ("LEAST_DISTORTION", "Distortion of lenses that is told [pixel]."),
@@ -416,7 +424,7 @@ MATERIALS = (
         )
     ),
     *(
-        Constant(f"beam_warp.reconstruction.alignment:{name}", "walker, runner, robot", does, EXACT_RIGS)
+        Constant(f"beam_warp.reconstruction.alignment:{name}", ALL, does, EXACT_RIGS)
         for name, does in (
             ("FIELD", "Side of the fields whose scores are told apart [pixel]."),
             ("OUTLIER", "Differences beyond it count by their sign [robust standard deviation]."),
@@ -425,7 +433,7 @@ MATERIALS = (
         )
     ),
     *(
-        Constant(f"beam_warp.reconstruction.masks:{name}", "walker, runner, robot", does, EXACT_MASKS)
+        Constant(f"beam_warp.reconstruction.masks:{name}", ALL, does, EXACT_MASKS)
         for name, does in (
             ("LEAST_RING", "Width from which a ring without light is no darkness of the subject [pixel]."),
             ("FADING", "Distance from the outline to a ring that colour fades to [pixel]."),
@@ -440,7 +448,7 @@ MATERIALS = (
         )
     ),
     *(
-        Constant(f"beam_warp.materials.light_turn:{name}", "walker, runner, robot", does, NO_SCORE)
+        Constant(f"beam_warp.materials.light_turn:{name}", ALL, does, NO_SCORE)
         for name, does in (
             ("TURN_NEIGHBORS", "Neighbours whose base colours are compared."),
             ("REACH", "Turns beside the best that the parabola goes through."),

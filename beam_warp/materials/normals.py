@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -142,14 +142,9 @@ class SurfacePoints:
         """
         device = scene.device
         agreement = evidence.agreement.numpy()
-        rows = np.flatnonzero(evidence.seen)
-        near = _neighbors(evidence.positions.numpy()[rows], device, FACE_NEIGHBORS)
-        # What views hardly show of a neighbour is hidden by others: it says little of the face.
-        weights = upload((cloud.opacities * np.minimum(evidence.weight, 1.0))[rows].astype(np.float32), float, device)
-        places = upload(evidence.positions.numpy()[rows], wp.vec3, device)
-        faces = _face_normals(cloud, evidence, rows, places, weights, near)
+        around = _Neighborhoods.of(cloud, evidence, device)
         normals = evidence.normals.numpy().copy()
-        normals[rows] = faces
+        normals[around.rows] = _face_normals(cloud, evidence, around)
         tracing, lift = (FACING, 0.0) if offset == "auto" else (EXACT, require_number("offset", offset))
         if tracing.cull:
             scene.face(_facing(cloud, evidence, normals))
@@ -162,6 +157,73 @@ class SurfacePoints:
             agreement,
             tracing,
         )
+
+    def on_faces(self, cloud: GaussianCloud, evidence: ViewEvidence) -> SurfacePoints:
+        """Return the same points with the normals of the faces that they lie on, however little flat these are.
+
+        Roundness is lost, so light is better gathered without. Highlights, though, are as wide as normals scatter.
+
+        Args:
+            cloud: The Gaussians.
+            evidence: What views show of them.
+        """
+        around = _Neighborhoods.of(cloud, evidence, self.normals.device)
+        normals = self.normals.numpy().copy()
+        normals[around.rows] = around.take_faces(normals[around.rows], least_flat=0.0)
+        return replace(self, normals=upload(normals, wp.vec3, self.normals.device))
+
+
+@dataclass(frozen=True, eq=False)
+class _Neighborhoods:
+    """The points that views show, ``(S,)`` of N, with those around each.
+
+    Attributes:
+        rows: Which Gaussians they are of, ``(S,)``.
+        places: Where they lie [m], ``(S,)`` vec3.
+        weights: How far each speaks for its face: what views hardly show is hidden by others, ``(S,)`` float.
+        near: Rows, among the points, of the nearest ones, the own one first, ``(S, K)`` int.
+    """
+
+    rows: NDArray[np.intp]
+    places: wp.array
+    weights: wp.array
+    near: wp.array
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud, evidence: ViewEvidence, device: wp.Device) -> _Neighborhoods:
+        """Find the points and their neighbours."""
+        rows = np.flatnonzero(evidence.seen)
+        places = evidence.positions.numpy()[rows]
+        weights = (cloud.opacities * np.minimum(evidence.weight, 1.0))[rows].astype(np.float32)
+        near = _neighbors(places, device, FACE_NEIGHBORS)
+        return cls(rows, upload(places, wp.vec3, device), upload(weights, float, device), near)
+
+    def mean_of_faces(self, normals: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Average normals over the faces that they belong to, ``(S, 3)``."""
+        device = self.near.device
+        current = upload(normals, wp.vec3, device)
+        following, count = wp.empty_like(current), min(NEIGHBOR_COUNT + 1, self.near.shape[1])
+        places, weights, near = self.places, self.weights, self.near
+        for _ in range(FACE_PASSES):
+            launch_mean_of_face(len(current), places, current, weights, near, count, FACE_SPREAD, following, device)
+            current, following = following, current
+        return current.numpy()
+
+    def take_faces(self, normals: NDArray[np.float32], least_flat: float) -> NDArray[np.float32]:
+        """Give points the normals of the faces in whose planes they lie, if these are flat enough, ``(S, 3)``."""
+        device = self.near.device
+        current = upload(normals, wp.vec3, device)
+        following = wp.empty_like(current)
+        support, flatness = (wp.empty(len(current), dtype=float, device=device) for _ in range(2))
+        rule = FaceRule()
+        rule.spread, rule.flat_spread, rule.least_flat = FACE_SPREAD, FLAT_SPREAD, least_flat
+        rule.around, rule.reach, rule.off_plane, rule.turn = FACE_AROUND, FACE_REACH, OFF_PLANE, FACE_TURN
+        places, weights, near = self.places, self.weights, self.near
+        for _ in range(FACE_PASSES):
+            launch_judge_faces(len(current), places, current, weights, near, rule, support, flatness, device)
+            launch_take_faces(len(current), places, current, weights, near, support, flatness, rule, following, device)
+            current, following = following, current
+        return current.numpy()
 
 
 def estimate_normals(
@@ -249,14 +311,7 @@ def _neighbors(places: NDArray[np.float32], device: wp.Device, most: int = NEIGH
     return upload(found.reshape(count, -1).astype(np.int32), int, device)
 
 
-def _face_normals(
-    cloud: GaussianCloud,
-    evidence: ViewEvidence,
-    rows: NDArray[np.intp],
-    places: wp.array,
-    weights: wp.array,
-    near: wp.array,
-) -> NDArray[np.float32]:
+def _face_normals(cloud: GaussianCloud, evidence: ViewEvidence, around: _Neighborhoods) -> NDArray[np.float32]:
     """Return normals of seen Gaussians that stay crisp at edges, ``(S, 3)``.
 
     What pixels see is a blend of the Gaussians in them, and spread back it is blended once more: edges are rounded
@@ -264,29 +319,14 @@ def _face_normals(
     pixels agree with the face, to within the noise of the axes, there is no edge, and they know the normal better.
     Last, what lies in the plane of a flat face takes its normal: rounded edges between flat faces become crisp.
     """
-    device = near.device
-    own, flatness = _shortest_axes(cloud.select(rows))
-    blended = evidence.normals.numpy()[rows]
+    own, flatness = _shortest_axes(cloud.select(around.rows))
+    blended = evidence.normals.numpy()[around.rows]
     towards = (own * blended).sum(axis=1)
     is_own = (flatness > 1.0 - FLAT_RATIO) & (np.abs(towards) > LEAST_TOWARDS)
     outward = own * np.where(towards < 0.0, -1.0, 1.0)[:, None]
-    current = upload(np.where(is_own[:, None], outward, blended).astype(np.float32), wp.vec3, device)
-    following, ring = wp.empty_like(current), near[:, : NEIGHBOR_COUNT + 1]
-    for _ in range(FACE_PASSES):
-        launch_mean_of_face(len(current), places, current, weights, ring, FACE_SPREAD, following, device)
-        current, following = following, current
-    faces = current.numpy()
+    faces = around.mean_of_faces(np.where(is_own[:, None], outward, blended).astype(np.float32))
     agrees = (faces * blended).sum(axis=1) > np.cos(0.5 * FACE_SPREAD)
-    current = upload(np.where(agrees[:, None], blended, faces), wp.vec3, device)
-    support, flatness = (wp.empty(len(current), dtype=float, device=device) for _ in range(2))
-    rule = FaceRule()
-    rule.spread, rule.flat_spread, rule.least_flat = FACE_SPREAD, FLAT_SPREAD, LEAST_FLAT
-    rule.around, rule.reach, rule.off_plane, rule.turn = FACE_AROUND, FACE_REACH, OFF_PLANE, FACE_TURN
-    for _ in range(FACE_PASSES):
-        launch_judge_faces(len(current), places, current, weights, near, rule, support, flatness, device)
-        launch_take_faces(len(current), places, current, weights, near, support, flatness, rule, following, device)
-        current, following = following, current
-    return current.numpy()
+    return around.take_faces(np.where(agrees[:, None], blended, faces), LEAST_FLAT)
 
 
 def _shortest_axes(cloud: GaussianCloud) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

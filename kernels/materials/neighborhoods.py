@@ -1,4 +1,4 @@
-"""Surface around each Gaussian from its neighbours: their thinnest direction, the normal that they agree on, its face."""
+"""Surface around each Gaussian from its neighbours: their thinnest direction, the normal they agree on, its face."""
 
 import warp as wp
 
@@ -108,16 +108,16 @@ def mean_of_face_kernel(
     normals: wp.array[wp.vec3],
     weights: wp.array[float],
     neighbors: wp.array2d[int],
+    count: int,
     spread: float,
     out_normals: wp.array[wp.vec3],
 ):
     """Mean of the normals around a point, of those that differ from its own by little (Tomasi and Manduchi 1998).
 
-    Weights fall with distance, by half of the farthest neighbour's, and with the difference of the normals, by
+    The first ``count`` neighbours have a part in it. Weights fall with distance, by half of the farthest neighbour's, and with the difference of the normals, by
     ``spread`` [rad]: what lies beyond an edge does not count.
     """
     i = first + wp.tid()
-    count = neighbors.shape[1]
     own = normals[i]
     reach = wp.max(wp.length(points[neighbors[i, count - 1]] - points[i]), 1.0e-12)
     total = wp.vec3()
@@ -196,9 +196,7 @@ def judge_faces_kernel(
 
 
 @wp.func
-def speaks_for(
-    offset: wp.vec3, own: wp.vec3, normal: wp.vec3, support: float, spacing: float, rule: FaceRule
-) -> float:
+def speaks_for(offset: wp.vec3, own: wp.vec3, normal: wp.vec3, support: float, spacing: float, rule: FaceRule) -> float:
     """How likely a point belongs to the face of a neighbour: how much of the surface there has its normal, how near it
     is, how near the point is to its plane, and how little the normal would turn."""
     near = bell(wp.length(offset), rule.reach * spacing) * bell(wp.dot(offset, normal), rule.off_plane * spacing)

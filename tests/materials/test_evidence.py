@@ -12,7 +12,12 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
-from beam_warp.kernels.materials.neighborhoods import launch_mean_of_face
+from beam_warp.kernels.materials.neighborhoods import (
+    FaceRule,
+    launch_judge_faces,
+    launch_mean_of_face,
+    launch_take_faces,
+)
 from beam_warp.materials.evidence import RADII, view_evidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.channels import RADIANCE
@@ -172,12 +177,101 @@ class TestFaces:
         weights, near = rng.uniform(0.1, 1.0, 40), np.argsort(np.linalg.norm(points[:, None] - points, axis=2))[:, :9]
         found = wp.empty(40, dtype=wp.vec3, device=device)
         arrays = upload(points, wp.vec3, device), upload(normals, wp.vec3, device), upload(weights, float, device)
-        launch_mean_of_face(40, *arrays, upload(near, int, device), 0.2, found, device)
+        launch_mean_of_face(40, *arrays, upload(near, int, device), 9, 0.2, found, device)
         reach = np.linalg.norm(points[near[:, -1]] - points, axis=1)[:, None]
         apart = np.linalg.norm(points[near] - points[:, None], axis=2) / reach
         turned = np.linalg.norm(normals[near] - normals[:, None], axis=2) / 0.2
         mean = ((weights[near] * np.exp(-2.0 * apart**2 - 0.5 * turned**2))[..., None] * normals[near]).sum(axis=1)
         np.testing.assert_allclose(found.numpy(), mean / np.linalg.norm(mean, axis=1, keepdims=True), atol=1e-5)
+
+    @staticmethod
+    def rule(least_flat):
+        rule = FaceRule()
+        rule.spread, rule.flat_spread, rule.least_flat = 0.2, 0.05, least_flat
+        rule.around, rule.reach, rule.off_plane, rule.turn = 1.1, 1.6, 0.16, 0.35
+        return rule
+
+    def taken(self, points, normals, weights, near, rule, device):
+        """Run one pass of both kernels: normals, and how flat the surface around each point is."""
+        count = len(points)
+        arrays = *(upload(it, wp.vec3, device) for it in (points, normals)), upload(weights, float, device)
+        near, found = upload(near, int, device), wp.empty(count, dtype=wp.vec3, device=device)
+        support, flatness = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+        launch_judge_faces(count, *arrays, near, rule, support, flatness, device)
+        launch_take_faces(count, *arrays, near, support, flatness, rule, found, device)
+        return found.numpy(), flatness.numpy()
+
+    @pytest.mark.parametrize("least_flat", [0.0, 0.3])
+    def test_faces_are_taken_as_numpy_takes_them(self, device, rng, least_flat):
+        count, rule = 60, self.rule(least_flat)
+        points = rng.uniform(size=(count, 3)) * (1.0, 1.0, 0.05)
+        normals = self.tilted(np.tile([0.0, 0.0, 1.0], (count, 1)), rng, 0.05)
+        normals[::4] = self.tilted(normals[::4], rng, 0.3)
+        weights, near = (
+            rng.uniform(0.1, 1.0, count),
+            np.argsort(np.linalg.norm(points[:, None] - points, axis=2))[:, :20],
+        )
+        found, _ = self.taken(points, normals, weights, near, rule, device)
+
+        def bell(distance, deviation):
+            return np.exp(-0.5 * (distance / deviation) ** 2)
+
+        offset = points[:, None] - points[near]
+        apart, turned = np.linalg.norm(offset, axis=2), np.linalg.norm(normals[near] - normals[:, None], axis=2)
+        spacing = apart[:, 8:9]
+        around = weights[near] * bell(apart, rule.around * spacing)
+        support, flat = (
+            (around * bell(turned, by)).sum(axis=1) / around.sum(axis=1) for by in (rule.spread, rule.flat_spread)
+        )
+        off_plane = (offset * normals[near]).sum(axis=2)
+        speaks = support[near] ** 2 * bell(apart, rule.reach * spacing) * bell(turned, rule.turn)
+        speaks *= bell(off_plane, rule.off_plane * spacing)
+        best = near[np.arange(count), speaks.argmax(axis=1)]
+        same = (
+            weights[near] * speaks * bell(np.linalg.norm(normals[near] - normals[best][:, None], axis=2), rule.spread)
+        )
+        expected = unit((same[..., None] * normals[near]).sum(axis=1))
+        takes = flat[best] > least_flat
+        assert takes.any()
+        assert takes.all() == (least_flat == 0.0)
+        np.testing.assert_allclose(found, np.where(takes[:, None], expected, normals), atol=1e-5)
+
+    def test_a_rounded_edge_between_flat_faces_becomes_crisp(self, device):
+        """A roof whose normals are blended over four spacings beside its ridge."""
+        spacing = 0.1
+        x, y = (
+            side.ravel() for side in np.meshgrid(np.arange(-1.0, 1.05, spacing) + 0.5 * spacing, np.arange(0, 1, 0.1))
+        )
+        slope = np.radians(35.0)
+        points = np.column_stack([x * np.cos(slope), y, -np.abs(x) * np.sin(slope)])
+        truth = np.column_stack([np.sign(x) * np.sin(slope), 0.0 * x, np.full(len(x), np.cos(slope))])
+        lean = slope * np.clip(x / (2.0 * spacing), -1.0, 1.0)
+        normals = np.column_stack([np.sin(lean), 0.0 * x, np.cos(lean)])
+        near = np.argsort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)[:, :33]
+        for _ in range(2):
+            normals, _ = self.taken(points, normals, np.ones(len(x)), near, self.rule(0.4), device)
+        degrees = np.degrees(np.arccos(np.clip((normals * truth).sum(axis=1), -1.0, 1.0)))
+        before = np.degrees(np.abs(lean - slope * np.sign(x)))
+        assert np.sqrt(np.mean(degrees**2)) < 0.6 * np.sqrt(np.mean(before**2))
+        assert np.mean(degrees > 5.0) < 0.6 * np.mean(before > 5.0)
+
+    def test_what_is_round_stays_as_it_is(self, device):
+        """A ball whose normals turn by a tenth from neighbour to neighbour is nowhere flat."""
+        points, _ = sphere_points(800)
+        near = np.argsort(np.linalg.norm(points[:, None] - points, axis=2))[:, :33]
+        found, flatness = self.taken(points, points, np.ones(800), near, self.rule(0.4), device)
+        assert flatness.max() < 0.4
+        np.testing.assert_array_equal(found, points.astype(np.float32))
+
+    def test_roughness_has_normals_of_faces_that_are_not_flat(self, ball, device):
+        found = view_evidence(ball, around(12), device=device)
+        points = SurfacePoints.seen_by(ball, found, Scene.from_gaussians(ball, device))
+        on_faces = points.on_faces(ball, found)
+        assert on_faces.positions is points.positions
+        normals, before = on_faces.normals.numpy()[found.seen], points.normals.numpy()[found.seen]
+        assert (normals != before).any()
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+        assert np.degrees(np.arccos(np.clip((normals * before).sum(axis=1), -1.0, 1.0))).max() < 15.0
 
 
 class TestColors:
