@@ -146,7 +146,7 @@ class TestKnownSpheres:
         assert within(found, 0.35, 2.0) > 0.95
 
     def test_normals_that_are_off_one_by_one_hardly_matter(self, device):
-        """Roughness is found on the faces that neighbours agree on; one by one, they would make it look like 0.52."""
+        """Faces are what neighbours agree on; one by one, such normals would make it look like 0.52."""
         assert np.median(solve_roughness(*profile_of(SKY, 0.35, device, tilt=0.25)).roughness) < 0.43
 
     def test_stated_errors_cover_what_many_places_are_off(self, device):
