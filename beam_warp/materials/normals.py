@@ -86,6 +86,59 @@ class SurfaceNormals:
 
 
 @dataclass(frozen=True, eq=False)
+class Neighborhoods:
+    """The points that views show, ``(S,)`` of N, with those around each.
+
+    Attributes:
+        rows: Which Gaussians they are of, ``(S,)``.
+        places: Where they lie [m], ``(S,)`` vec3.
+        weights: How far each speaks for its face: what views hardly show is hidden by others, ``(S,)`` float.
+        near: Rows, among the points, of the nearest ones, the own one first, ``(S, K)`` int.
+    """
+
+    rows: NDArray[np.intp]
+    places: wp.array
+    weights: wp.array
+    near: wp.array
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud, evidence: ViewEvidence, device: wp.Device) -> Neighborhoods:
+        """Find the points and their neighbours."""
+        rows = np.flatnonzero(evidence.seen)
+        places = evidence.positions.numpy()[rows]
+        weights = (cloud.opacities * np.minimum(evidence.weight, 1.0))[rows].astype(np.float32)
+        near = _neighbors(places, device, FACE_NEIGHBORS)
+        return cls(rows, upload(places, wp.vec3, device), upload(weights, float, device), near)
+
+    def mean_of_faces(self, normals: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Average normals over the faces that they belong to, ``(S, 3)``."""
+        device = self.near.device
+        current = upload(normals, wp.vec3, device)
+        following, count = wp.empty_like(current), min(NEIGHBOR_COUNT + 1, self.near.shape[1])
+        places, weights, near = self.places, self.weights, self.near
+        for _ in range(FACE_PASSES):
+            launch_mean_of_face(len(current), places, current, weights, near, count, FACE_SPREAD, following, device)
+            current, following = following, current
+        return current.numpy()
+
+    def take_faces(self, normals: NDArray[np.float32], least_flat: float) -> NDArray[np.float32]:
+        """Give points the normals of the faces in whose planes they lie, if these are flat enough, ``(S, 3)``."""
+        device = self.near.device
+        current = upload(normals, wp.vec3, device)
+        following = wp.empty_like(current)
+        support, flatness = (wp.empty(len(current), dtype=float, device=device) for _ in range(2))
+        rule = FaceRule()
+        rule.spread, rule.flat_spread, rule.least_flat = FACE_SPREAD, FLAT_SPREAD, least_flat
+        rule.around, rule.reach, rule.off_plane, rule.turn = FACE_AROUND, FACE_REACH, OFF_PLANE, FACE_TURN
+        places, weights, near = self.places, self.weights, self.near
+        for _ in range(FACE_PASSES):
+            launch_judge_faces(len(current), places, current, weights, near, rule, support, flatness, device)
+            launch_take_faces(len(current), places, current, weights, near, support, flatness, rule, following, device)
+            current, following = following, current
+        return current.numpy()
+
+
+@dataclass(frozen=True, eq=False)
 class SurfacePoints:
     """Points where the light of each Gaussian is gathered; arrays of Warp are on the scene's device.
 
@@ -97,6 +150,7 @@ class SurfacePoints:
         normal_error: By how much normals may be off [rad], ``(N,)`` float32; 0 where it is not known.
         confidence: Of the normals, in [0, 1], ``(N,)`` float32.
         tracing: What is in the way of rays from these points.
+        around: What lies around the points that views show; None without views.
     """
 
     positions: wp.array
@@ -106,6 +160,7 @@ class SurfacePoints:
     normal_error: NDArray[np.float32]
     confidence: NDArray[np.float32]
     tracing: TraceOptions = EXACT
+    around: Neighborhoods | None = None
 
     @classmethod
     def at_centers(
@@ -142,7 +197,7 @@ class SurfacePoints:
         """
         device = scene.device
         agreement = evidence.agreement.numpy()
-        around = _Neighborhoods.of(cloud, evidence, device)
+        around = Neighborhoods.of(cloud, evidence, device)
         normals = evidence.normals.numpy().copy()
         normals[around.rows] = _face_normals(cloud, evidence, around)
         tracing, lift = (FACING, 0.0) if offset == "auto" else (EXACT, require_number("offset", offset))
@@ -156,74 +211,20 @@ class SurfacePoints:
             np.arccos(np.clip(agreement, 0.0, 1.0)).astype(np.float32),
             agreement,
             tracing,
+            around,
         )
 
-    def on_faces(self, cloud: GaussianCloud, evidence: ViewEvidence) -> SurfacePoints:
+    def on_faces(self) -> SurfacePoints:
         """Return the same points with the normals of the faces that they lie on, however little flat these are.
 
         Roundness is lost, so light is better gathered without. Highlights, though, are as wide as normals scatter.
-
-        Args:
-            cloud: The Gaussians.
-            evidence: What views show of them.
+        Points that no views show stay as they are.
         """
-        around = _Neighborhoods.of(cloud, evidence, self.normals.device)
+        if self.around is None:
+            return self
         normals = self.normals.numpy().copy()
-        normals[around.rows] = around.take_faces(normals[around.rows], least_flat=0.0)
+        normals[self.around.rows] = self.around.take_faces(normals[self.around.rows], least_flat=0.0)
         return replace(self, normals=upload(normals, wp.vec3, self.normals.device))
-
-
-@dataclass(frozen=True, eq=False)
-class _Neighborhoods:
-    """The points that views show, ``(S,)`` of N, with those around each.
-
-    Attributes:
-        rows: Which Gaussians they are of, ``(S,)``.
-        places: Where they lie [m], ``(S,)`` vec3.
-        weights: How far each speaks for its face: what views hardly show is hidden by others, ``(S,)`` float.
-        near: Rows, among the points, of the nearest ones, the own one first, ``(S, K)`` int.
-    """
-
-    rows: NDArray[np.intp]
-    places: wp.array
-    weights: wp.array
-    near: wp.array
-
-    @classmethod
-    def of(cls, cloud: GaussianCloud, evidence: ViewEvidence, device: wp.Device) -> _Neighborhoods:
-        """Find the points and their neighbours."""
-        rows = np.flatnonzero(evidence.seen)
-        places = evidence.positions.numpy()[rows]
-        weights = (cloud.opacities * np.minimum(evidence.weight, 1.0))[rows].astype(np.float32)
-        near = _neighbors(places, device, FACE_NEIGHBORS)
-        return cls(rows, upload(places, wp.vec3, device), upload(weights, float, device), near)
-
-    def mean_of_faces(self, normals: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Average normals over the faces that they belong to, ``(S, 3)``."""
-        device = self.near.device
-        current = upload(normals, wp.vec3, device)
-        following, count = wp.empty_like(current), min(NEIGHBOR_COUNT + 1, self.near.shape[1])
-        places, weights, near = self.places, self.weights, self.near
-        for _ in range(FACE_PASSES):
-            launch_mean_of_face(len(current), places, current, weights, near, count, FACE_SPREAD, following, device)
-            current, following = following, current
-        return current.numpy()
-
-    def take_faces(self, normals: NDArray[np.float32], least_flat: float) -> NDArray[np.float32]:
-        """Give points the normals of the faces in whose planes they lie, if these are flat enough, ``(S, 3)``."""
-        device = self.near.device
-        current = upload(normals, wp.vec3, device)
-        following = wp.empty_like(current)
-        support, flatness = (wp.empty(len(current), dtype=float, device=device) for _ in range(2))
-        rule = FaceRule()
-        rule.spread, rule.flat_spread, rule.least_flat = FACE_SPREAD, FLAT_SPREAD, least_flat
-        rule.around, rule.reach, rule.off_plane, rule.turn = FACE_AROUND, FACE_REACH, OFF_PLANE, FACE_TURN
-        places, weights, near = self.places, self.weights, self.near
-        for _ in range(FACE_PASSES):
-            launch_judge_faces(len(current), places, current, weights, near, rule, support, flatness, device)
-            launch_take_faces(len(current), places, current, weights, near, support, flatness, rule, following, device)
-            current, following = following, current
-        return current.numpy()
 
 
 def estimate_normals(
@@ -311,7 +312,7 @@ def _neighbors(places: NDArray[np.float32], device: wp.Device, most: int = NEIGH
     return upload(found.reshape(count, -1).astype(np.int32), int, device)
 
 
-def _face_normals(cloud: GaussianCloud, evidence: ViewEvidence, around: _Neighborhoods) -> NDArray[np.float32]:
+def _face_normals(cloud: GaussianCloud, evidence: ViewEvidence, around: Neighborhoods) -> NDArray[np.float32]:
     """Return normals of seen Gaussians that stay crisp at edges, ``(S, 3)``.
 
     What pixels see is a blend of the Gaussians in them, and spread back it is blended once more: edges are rounded

@@ -204,8 +204,7 @@ def measure_roughness_profile(
     """
     device = scene.device
     count = len(cloud)
-    if views is not None:
-        points = points.on_faces(cloud, views)
+    points = points.on_faces()
     shown = np.flatnonzero(points.seen)
     # Any roughness will do here: the candidates take its place.
     measured = lit_points(cloud, points, np.ones(count, np.float32), light, shown, views)

@@ -266,7 +266,7 @@ class TestFaces:
     def test_roughness_has_normals_of_faces_that_are_not_flat(self, ball, device):
         found = view_evidence(ball, around(12), device=device)
         points = SurfacePoints.seen_by(ball, found, Scene.from_gaussians(ball, device))
-        on_faces = points.on_faces(ball, found)
+        on_faces = points.on_faces()
         assert on_faces.positions is points.positions
         normals, before = on_faces.normals.numpy()[found.seen], points.normals.numpy()[found.seen]
         assert (normals != before).any()

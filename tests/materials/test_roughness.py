@@ -20,7 +20,7 @@ from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.light_rays import MaterialOptions
-from beam_warp.materials.normals import SurfacePoints
+from beam_warp.materials.normals import Neighborhoods, SurfacePoints
 from beam_warp.materials.roughness import (
     CANDIDATES,
     MODEL_ERROR,
@@ -98,6 +98,7 @@ def profile_of(
         vectors(np.broadcast_to(directions[:, None], (view_count, count, 3))),
         np.zeros((count, 3), np.float32),
     )
+    points = replace(points, around=Neighborhoods.of(cloud, views, scene.device))
     light = light_of(sky, str(scene.device))
     profile = measure_roughness_profile(cloud, scene, points, light, views, options=OPTIONS, frame=frame)
     return normals, profile
