@@ -114,8 +114,8 @@ def mean_of_face_kernel(
 ):
     """Mean of the normals around a point, of those that differ from its own by little (Tomasi and Manduchi 1998).
 
-    The first ``count`` neighbours have a part in it. Weights fall with distance, by half of the farthest one's, and with
-    the difference of the normals, by ``spread`` [rad]: what lies beyond an edge does not count.
+    The first ``count`` neighbours have a part in it. Weights fall with distance, by half of the farthest one's, and
+    with the difference of the normals, by ``spread`` [rad]: what lies beyond an edge does not count.
     """
     i = first + wp.tid()
     own = normals[i]
