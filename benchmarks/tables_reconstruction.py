@@ -9,6 +9,7 @@ from typing import Any
 from tables import Row, Rows, cell, figure, number, table
 
 MAIN = "reconstruction_h200.json"
+LARGE = "reconstruction_large_h200.json"
 CHOICES = "reconstruction_choices_h200.json"
 STRIDES = "reconstruction_strides_h200.json"
 WALK, WITH_CASE = "steady_walk_h200.json", "steady_case_h200.json"
@@ -112,7 +113,7 @@ def _trial_rows(title: str, rows: Sequence[Row]) -> Rows:
     return found
 
 
-@table("reconstruction_large", MAIN)
+@table("reconstruction_large", LARGE)
 def large(main: Row) -> Rows:
     """Return time, scores and memory of frames at full resolution."""
     heads = (
@@ -211,7 +212,7 @@ def frames_lost(main: Row) -> int:
     return sum(bool(row["lost"]) for part in main["captures"]["rows"] for row in part["frames"])
 
 
-@number("host_growth", MAIN)
+@number("host_growth", LARGE)
 def host_growth(main: Row) -> float:
     """Return what a tracked frame adds to the host's memory, after the first two [byte]."""
     held = [row["host_bytes_after_trim"] for row in main["large"]["frames"][2:]]
