@@ -67,9 +67,9 @@ def relit(result: Row) -> Rows:
     return rows
 
 
-@table("results_materials", EVALUATION, ABLATION)
-def results(result: Row, ablation: Row) -> Rows:
-    """PSNR alone, relit by the mean over lights; captures that were not evaluated have the ends of the ladder."""
+@table("results_materials", EVALUATION)
+def results(result: Row) -> Rows:
+    """PSNR alone, relit by the mean over lights."""
     rows: list[Sequence[Any]] = [
         ("PSNR [dB]", "ambient occlusion", "base colour", "roughness", "relit, deferred", "relit, path traced")
     ]
@@ -78,13 +78,6 @@ def results(result: Row, ablation: Row) -> Rows:
         channels = [mean[channel] for channel in ("ambient_occlusion", "base_color", "roughness")]
         channels += [mean["relit_mean"][renderer] for renderer in ("deferred", "path")]
         rows.append((name, *(f"{score['psnr']:.1f}" for score in channels)))
-    for name, part in ablation["ablation"]["captures"].items():
-        if name not in result["evaluation"]["captures"]:
-            ladder = [row for row in part["rows"] if row["group"] == "ladder"]
-            for way, row in (("direct", ladder[-1]), ("paper, bilateral", ladder[0])):
-                scores = [row["ambient_occlusion"]["psnr"], row["base_color"]["psnr"], row["relit"]["mean"]["psnr"]]
-                occlusion, color, relit = (f"{score:.1f}" for score in scores)
-                rows.append((f"{name}, {way}", occlusion, color, "", relit, ""))
     return rows
 
 

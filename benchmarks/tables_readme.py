@@ -13,7 +13,7 @@ SHADOWS = "environment with 16 shadow maps, 2 bounces"
     "tracing_h200.json",
     "raster_h200.json",
     "reconstruction_h200.json",
-    "materials_ablation_h200.json",
+    "materials_evaluation_h200.json",
     "relight_speed_h200.json",
 )
 def readme(tracing: Row, raster: Row, reconstruction: Row, materials: Row, relight: Row) -> Rows:
@@ -73,9 +73,9 @@ def _reconstructions(result: Row) -> Rows:
 
 def _materials(result: Row) -> Rows:
     rows = []
-    for name, part in result["ablation"]["captures"].items():
-        ladder = [row for row in part["rows"] if row["group"] == "ladder"]
-        rows.append([f"materials of {name}", _scores(ladder[-1]), f"the paper's recipe: {_scores(ladder[0])}"])
+    for name, part in result["evaluation"]["captures"].items():
+        ours, paper = (_scores(part["ways"][way]["mean"]) for way in ("direct", "paper, bilateral"))
+        rows.append([f"materials of {name}", ours, f"the paper's recipe: {paper}"])
     return rows
 
 
