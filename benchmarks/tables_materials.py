@@ -196,7 +196,7 @@ def light_check(result: Row) -> Rows:
 @table("geometry_budget", "geometry_budget_h200.json")
 def geometry_budget(result: Row) -> Rows:
     """Return the drawn occlusion of every combination of true and found places, normals and occluders, by capture."""
-    captures = result["captures"]
+    captures = _in_order(result["captures"])
     return [
         ["ambient occlusion [dB]", *captures],
         *(
@@ -213,13 +213,18 @@ def geometry_places(result: Row) -> Rows:
     rows: Rows = [
         ["", "of all pixels", "distance to the true surface [mm]: tenth, median, ninetieth", "normals: median, mean"]
     ]
-    for name, found in result["captures"].items():
+    for name, found in _in_order(result["captures"]).items():
         for kind in kinds:
             place = found["places"][kind]
             signed = ", ".join(f"{value:+.1f}" for value in place["signed_mm"])
             middle, _, mean = place["normal_degrees"]
             rows.append([f"{name}, {kind}", f"{100 * place['share']:.0f} %", signed, f"{middle:.1f}°, {mean:.1f}°"])
     return rows
+
+
+def _in_order(captures: Row) -> Row:
+    """Return captures in the order of the other tables, however they were asked for."""
+    return {name: captures[name] for name in ("walker", "runner", "robot") if name in captures}
 
 
 @table("light_turn", "light_turn_cpu.json")

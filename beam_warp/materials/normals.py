@@ -54,7 +54,7 @@ FACE_NEIGHBORS = 32
 FLAT_SPREAD = 0.05
 LEAST_FLAT = 0.4
 """Standard deviation of normals within a flat face [rad], and the part of a neighbourhood that must differ by no more.
-Bodies and cloth are hardly ever as flat: their normals stay."""
+Less flat faces would turn what is round into facets."""
 
 FACE_AROUND = 1.1
 FACE_REACH = 1.6
