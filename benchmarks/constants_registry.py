@@ -366,7 +366,6 @@ MATERIALS = (
             ("DARKEST", "Colour of points that are left out, of the median."),
             ("LEAST_CHANCE", "Least probability of a roughness."),
             ("LEAST_SPREAD", "Least standard deviation of a colour."),
-            ("FIT_GAUSSIANS", "Gaussians of the surface at which views are compared."),
             ("MODEL_ERROR", "Error of exposures that halves of the points share [logarithm]."),
         )
     ),
@@ -586,7 +585,7 @@ UNTUNED = {
         beam_warp.reconstruction.unmasked: PIXELS
         beam_warp.kernels.reconstruction.patch_match: STEP SIDE SAMPLES
         beam_warp.reconstruction.photometry: FEWEST_CAMERAS FEWEST_POINTS MOST_POINTS LEAST_VIEWS ROUNDS SETTLED
-        beam_warp.reconstruction.photometry: LARGEST_SIDE LEAST_VARIANCE
+        beam_warp.reconstruction.photometry: LEAST_VARIANCE
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP
         beam_warp.reconstruction.temporal: SMALLEST_SPACING

@@ -201,6 +201,7 @@ class ReconstructionWork:
     notes: list[str]
     _reader: FrameReader | None = None
     _latest: tuple[int, Sequence[CapturedView]] | None = None
+    _mended: tuple[str, list[CapturedView]] | None = None
 
     @classmethod
     def prepare(
@@ -334,7 +335,7 @@ class ReconstructionWork:
             self._latest = None
             return {}
         self._latest = None
-        views = self._images().views(step.frame)
+        views = self._views(self._images(), step.frame)
         self._latest = step.frame, views
         for following in task.following:
             if following.stage in ("frame", "seam") and following.frame is not None:
@@ -344,19 +345,25 @@ class ReconstructionWork:
 
     def close(self) -> None:
         """End the threads that read."""
-        self._latest = None
+        self._latest = self._mended = None
         if self._reader is not None:
             self._reader.__exit__()
             self._reader = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what other processes need: no threads, no images, nothing that was read."""
-        return {**{field.name: vars(self)[field.name] for field in fields(self)}, "_reader": None, "_latest": None}
+        kept = {field.name: vars(self)[field.name] for field in fields(self)}
+        return kept | dict.fromkeys(("_reader", "_latest", "_mended"))
 
     def _images(self) -> FrameReader:
         if self._reader is None:
             self._reader = FrameReader(self.records, self.store.digests)
         return self._reader
+
+    def _views(self, reader: FrameReader, frame: int) -> list[CapturedView]:
+        """Return the images of a frame: those at which it was last looked for what is wrong, if they are the same."""
+        kept, self._mended = self._mended, None  # not both in memory
+        return kept[1] if kept is not None and kept[0] == reader.digest(frame) else reader.views(frame)
 
     def _mend(self, stage: str, progress: NotedProgress) -> dict[str, Any]:
         """Find something wrong with the capture, what was found before it put right."""
@@ -366,7 +373,9 @@ class ReconstructionWork:
         records = _corrected({frame: self.frames.records[frame]}, known)
         with FrameReader(records, self.store.digests) as reader:
             names = [record.camera_name for record in records[frame]]
-            found = mend.find(self.steps, names, reader.views(frame), within(progress, stage, frame))
+            views = self._views(reader, frame)
+            self._mended = reader.digest(frame), views
+            found = mend.find(self.steps, names, views, within(progress, stage, frame))
         if found is None:
             (self.folder / mend.kind.FILE).unlink(missing_ok=True)
         else:

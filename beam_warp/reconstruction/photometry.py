@@ -34,20 +34,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
 from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LUMINANCE
-from beam_warp.jobs.listeners import no_progress
 from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS, blurred_environment
-from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
-from beam_warp.reconstruction.frames.protocols import StepProgress
-from beam_warp.reconstruction.initial import initial_gaussians, view_samples
-from beam_warp.reconstruction.track import outward_normals
+from beam_warp.reconstruction.initial import view_samples
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -68,7 +63,7 @@ CHANCE = 1e-3
 
 MODEL_ERROR = 0.015
 """Error of the logarithms of exposures that halves of the points share, because the surface is wrong: cameras of
-walker, runner and robot, whose exposures are equal, seem to differ by 0.008, 0.019 and 0.027 (root mean square)."""
+walker, runner and robot, whose exposures are equal, seem to differ by 0.006, 0.007 and 0.018 (root mean square)."""
 
 MOST_POINTS = 1_024
 """Most points that are compared, evenly chosen."""
@@ -94,12 +89,6 @@ LEAST_CHANCE, LEAST_VARIANCE = 0.01, 1e-4
 LEAST_SPREAD = 0.01
 """Least standard deviation of a colour that is assumed, of itself: that of eight bits and of filters."""
 
-FIT_GAUSSIANS = 10_000
-"""Most Gaussians of the surface at which views are compared."""
-
-LARGEST_SIDE = 320
-"""Pixels of a side at which views are compared, about."""
-
 
 @dataclass(frozen=True, eq=False)
 class SolvedGains:
@@ -120,38 +109,38 @@ class SolvedGains:
         return float(np.sqrt(np.mean(np.square(self.apart @ what)) + np.mean(np.square(self.gloss @ what))))
 
 
+def may_compare(views: Sequence[CapturedView]) -> bool:
+    """Return whether views are as many as it takes, and show where the subject ends."""
+    return len(views) >= FEWEST_CAMERAS and all(view.alpha is not None for view in views)
+
+
 def find_exposures(
     names: Sequence[str],
     views: Sequence[CapturedView],
+    cloud: GaussianCloud,
+    normals: NDArray[np.floating],
     environment: EnvironmentMap,
-    options: FitOptions,
     *,
     device: str | None = None,
-    progress: StepProgress = no_progress,
 ) -> RigExposures | None:
     """Find exposures and white balances of the cameras of a rig.
 
     Args:
         names: Names of the cameras.
-        views: The photograph of each of them at one moment, with masks.
+        views: The photograph of each of them at one moment.
+        cloud: The Gaussians of that moment.
+        normals: Which way the surface faces, ``(N, 3)``; 0 where it is not known.
         environment: The light of the capture, in units of the photographs.
-        options: How key frames are fitted.
         device: Warp device; None takes the first CUDA device, or the CPU.
-        progress: Called with (done, total, facts), in steps.
 
     Returns:
-        What was found; None where there are fewer than `FEWEST_CAMERAS`, a view has no mask, or the views share too
-        little.
+        What was found; None where the views share too little.
 
     Raises:
-        InvalidArrayError: The masks have no volume in common.
         DeviceError: There is no such device.
     """
-    if len(views) < FEWEST_CAMERAS or any(view.alpha is None for view in views):
-        return None
-    reduced = [view.reduced(max(1, min(view.camera.width, view.camera.height) // LARGEST_SIDE)) for view in views]
-    cloud, normals = _surface(reduced, options, device, progress)
-    samples = view_samples(reduced, cloud, normals, device=device).numpy()
+    normals = _smoothed(cloud.positions, normals)
+    samples = view_samples(views, cloud, normals, device=device).numpy()
     rows = np.flatnonzero(((samples[..., 3] > 0.0).sum(axis=0) >= LEAST_VIEWS) & normals.any(axis=1))
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 2 * MOST_POINTS)).astype(int)]
     positions = cloud.positions[rows].astype(np.float64)
@@ -162,21 +151,12 @@ def find_exposures(
     return None if solved is None else judged(names, solved)
 
 
-def _surface(
-    views: Sequence[CapturedView], options: FitOptions, device: str | None, progress: StepProgress
-) -> tuple[GaussianCloud, NDArray[np.float32]]:
-    """Return Gaussians that a quick fit brings to the surface, and their normals, 0 where these are not known."""
-    count = min(options.gaussian_count, FIT_GAUSSIANS)
-    start = initial_gaussians(views, count, device=device, seed=options.seed)
-    fitting = FitOptions.of_preset("draft", gaussian_count=count, raster=options.raster, samples=1, seed=options.seed)
-    cloud = fit_gaussians(views, start, fitting, device=device, progress=progress).cloud
-    outward = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])
-    nearest = cKDTree(start.positions).query(cloud.positions, workers=-1)[1]
-    normals = outward_normals(cloud, outward[nearest])
-    near = cKDTree(cloud.positions).query(cloud.positions, k=min(NEIGHBORS, len(cloud)), workers=-1)[1]
-    mean = normals[near.reshape(len(cloud), -1)].sum(axis=1)
+def _smoothed(positions: NDArray[np.floating], normals: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the mean direction of the nearest normals, 0 where there is none."""
+    near = cKDTree(positions).query(positions, k=min(NEIGHBORS, len(positions)), workers=-1)[1]
+    mean = normals[near.reshape(len(positions), -1)].sum(axis=1)
     length = np.linalg.norm(mean, axis=1, keepdims=True)
-    return cloud, np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.0)
+    return np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.0)
 
 
 def highlights(

@@ -25,7 +25,7 @@ from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.reconstruction.masks import mend_masks
-from beam_warp.reconstruction.photometry import find_exposures
+from beam_warp.reconstruction.photometry import find_exposures, may_compare
 from beam_warp.reconstruction.rig import refine_rig
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
 from beam_warp.reconstruction.unmasked import seen_in_common, unmasked_gaussians
@@ -65,6 +65,11 @@ class FitAndTrack:
     points: SparsePoints | None = None
     environment: EnvironmentMap | None = None
     device: str | None = None
+    _begun: list[tuple[Sequence[CapturedView], tuple[Track, dict[str, Any]]]] = field(default_factory=list, init=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what other processes need: no images, and nothing that was fitted."""
+        return {**vars(self), "_begun": []}
 
     @property
     def raster(self) -> RasterOptions:
@@ -99,13 +104,25 @@ class FitAndTrack:
     def find_exposures(
         self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
     ) -> RigExposures | None:
-        """Find exposures and white balances of a rig, from what its cameras show at one moment; None without light."""
-        if self.environment is None:
+        """Find exposures and white balances of a rig, from what its cameras show at one moment; None without light.
+
+        They are compared at a key frame's surface. It is kept: where nothing is undone, the frame begins with the same.
+        """
+        if self.environment is None or not may_compare(views):
             return None
-        return find_exposures(names, views, self.environment, self.fitting, device=self.device, progress=progress)
+        begun = self.begin(views, progress)
+        self._begun.append((views, begun))
+        track = begun[0]
+        return find_exposures(names, views, track.cloud, track.normals(), self.environment, device=self.device)
 
     def begin(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
-        """Fit a key frame from its images alone, their exposures matched."""
+        """Fit a key frame from its images alone, their exposures matched; images just compared are not fitted again."""
+        known = [begun for seen, begun in self._begun if seen is views]
+        self._begun.clear()
+        return known[0] if known else self._fitted(views, progress)
+
+    def _fitted(self, views: Sequence[CapturedView], progress: StepProgress) -> tuple[Track, dict[str, Any]]:
+        """Fit a key frame; see `begin`."""
         is_bare = self.points is None and all(view.alpha is None for view in views)
         fitting = _borne(self.fitting, len(views)) if is_bare else self.fitting
         start, findings, said = self._start(views, fitting.gaussian_count), [], {}

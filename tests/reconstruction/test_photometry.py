@@ -1,12 +1,15 @@
 """Exposures told from gloss: exact for matte points, within their errors for glossy ones, nothing where none is off."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS
 from beam_warp.reconstruction import photometry
-from beam_warp.reconstruction.fit import Fit, FitOptions
+from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.photometry import (
     LEVELS,
     MODEL_ERROR,
@@ -14,6 +17,7 @@ from beam_warp.reconstruction.photometry import (
     find_exposures,
     highlights,
     judged,
+    may_compare,
     solve_gains,
 )
 from beam_warp.world.environment import EnvironmentMap
@@ -134,11 +138,14 @@ def test_a_uniform_light_is_mirrored_as_the_albedo_says():
 def test_a_sound_capture_is_left_alone(tiny_capture, monkeypatch):
     """The points are those of the visual hull here, for a fit takes long; of six cameras few see one of them."""
     monkeypatch.setattr(photometry, "LEAST_VIEWS", 2)
-    monkeypatch.setattr(photometry, "fit_gaussians", lambda views, start, *args, **more: Fit(start))
     records = tiny_capture.select(split="train", frames=[0])
     views, names = [record.view() for record in records], [record.camera_name for record in records]
+    hull = initial_gaussians(views, 1000, device="cpu")
+    outward = Rotation.from_quat(hull.orientations).apply([0.0, 0.0, 1.0])
     light = EnvironmentMap.read(tiny_capture.environment_path)
-    found = find_exposures(names, views, light, FitOptions(gaussian_count=1000), device="cpu")
+    found = find_exposures(names, views, hull, outward, light, device="cpu")
     assert [camera.camera for camera in found.cameras] == names
     assert found.findings() == []
-    assert find_exposures(names[:5], views[:5], light, FitOptions(), device="cpu") is None
+    assert may_compare(views)
+    assert not may_compare(views[:5])
+    assert not may_compare([*views[1:], replace(views[0], alpha=None)])
