@@ -88,6 +88,9 @@ SPECK = 24
 KEY_BLUR = 0.5
 """Standard deviation that gives the outline of keyed pixels the softness of a pixel's area [pixel]."""
 
+BLURRED = 0.3
+"""A backdrop is known if its standard error is less than this part of the contrast."""
+
 SURE = 3.0
 """What is less than this many standard errors from 0 counts as 0."""
 
@@ -118,12 +121,16 @@ class Matte:
         alpha: Coverage in [0, 1], ``(H, W)`` float32.
         offset: How far the given mask reaches beyond the subject; None where the photograph does not tell.
         doubt: How much is not known of a pixel, 0 to 1, ``(H, W)`` float32: coverage and colour are a guess there.
+        scene: The photograph; where the backdrop is not known, the subject alone, ``(H, W, 3)`` float32.
+        behind: The backdrop alone, 0 where it is not known, ``(H, W, 3)`` float32.
     """
 
     color: NDArray[np.float32]
     alpha: NDArray[np.float32]
     offset: MaskOffset | None
     doubt: NDArray[np.float32]
+    scene: NDArray[np.float32]
+    behind: NDArray[np.float32]
 
 
 def matte(
@@ -141,7 +148,8 @@ def matte(
     """
     outline = _outline(mask)
     if outline is None:
-        return Matte(photograph * mask[..., None], mask, None, np.zeros_like(mask))
+        color = photograph * mask[..., None]
+        return Matte(color, mask, None, np.zeros_like(mask), color, np.zeros_like(color))
     at = tuple(outline.near.T)
     empty = np.float32(0.0) if plate is None else plate
     seen = np.clip(photograph, -BRIGHTEST, BRIGHTEST)
@@ -162,7 +170,12 @@ def matte(
     alpha = (0.5 * (whole + parts)).astype(np.float32)
     color = photograph * alpha[..., None]
     color[at] = _subject(seen[at], alpha[at], inner, outer, outline.nearest)
-    return Matte(color, alpha, offset, np.abs(whole - parts))
+    scene, behind = color.copy(), np.zeros_like(color)
+    contrast = np.square(inner.values - outer.values).sum(axis=1)
+    sure = 3.0 * outer.variances[outline.nearest] < BLURRED**2 * contrast
+    known = tuple(outline.near[sure].T)
+    scene[known], behind[known] = seen[known], np.maximum(outer.values[sure], 0.0)
+    return Matte(color, alpha, offset, np.abs(whole - parts), scene, behind)
 
 
 def moved_mask(mask: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:

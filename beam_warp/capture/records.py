@@ -18,7 +18,7 @@ from beam_warp.capture.cutouts import taken_in
 from beam_warp.capture.lenses import Lens
 from beam_warp.capture.mattes import MaskOffset, keyed, matte
 from beam_warp.capture.undistort import COLORS, Intrinsics, Undistortion
-from beam_warp.capture.views import CapturedView
+from beam_warp.capture.views import Backdrop, CapturedView
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.image.files import SUFFIXES, Image, read_image
@@ -140,12 +140,12 @@ class CaptureRecord:
             MissingFileError: The image, or the mask or plate that the capture names, does not exist.
             AssetFormatError: A file is damaged, not of the camera's size, or holds values that no image has.
         """
-        image, offset = self.photograph(), None
+        image, offset, backdrop = self.photograph(), None, None
         mask = None if self.mask_path is None else _coverage(self._sized(self._read(self.mask_path), "mask"))
         if (scene := _scene(image)) is not None:
             if image.alpha is not None and not _is_opaque(image.alpha):
                 mask = image.alpha if mask is None else image.alpha * mask
-            image, offset = self._cut_out(image, scene, mask)
+            image, offset, backdrop = self._cut_out(image, scene, mask)
         elif mask is not None:
             image = _masked(image, mask)
         image = self._undistorted(image)
@@ -162,8 +162,6 @@ class CaptureRecord:
                 f"image must be finite, got NaN or infinity in {int((~np.isfinite(color)).any(axis=-1).sum())} pixels "
                 f"at {self.image_path}. Export it again, or repair those pixels."
             )
-        if self.gains != (1.0, 1.0, 1.0):
-            color = color / np.array(self.gains, np.float32)
         doubt = image.channels.get(DOUBT)
         found = CapturedView(
             name=self.name,
@@ -172,7 +170,10 @@ class CaptureRecord:
             alpha=alpha,
             doubt=doubt if doubt is not None and doubt.any() else None,
             mask_offset=offset,
+            backdrop=backdrop,
         )
+        if self.gains != (1.0, 1.0, 1.0):
+            found = found.brightened(1.0 / np.array(self.gains))
         return taken_in(found, self.mask_excess)
 
     def truth(self) -> Image:
@@ -222,18 +223,24 @@ class CaptureRecord:
 
     def _cut_out(
         self, image: Image, scene: NDArray[np.float32], mask: NDArray[np.float32] | None
-    ) -> tuple[Image, MaskOffset | None]:
-        """Return a photograph with the subject's coverage and colour alone, and how far off its mask was."""
+    ) -> tuple[Image, MaskOffset | None, Backdrop | None]:
+        """Return a photograph with the subject's coverage and colour alone, how far off its mask was, and all of it."""
         plate = self._plate()
         if mask is None and plate is None:
-            return image, None
+            return image, None, None
         if not np.isfinite(scene).all() or (mask is not None and not _is_coverage(mask)):
-            return (image if mask is None else _masked(_opaque(image), mask)), None  # as it is, and then refused
+            return (image if mask is None else _masked(_opaque(image), mask)), None, None  # as it is, and then refused
         start = keyed(scene, cast("NDArray[np.float32]", plate)) if mask is None else np.clip(mask, 0.0, 1.0)
         found = matte(scene, start, plate)
         planes = dict(zip([*"RGBA", DOUBT], [*np.moveaxis(found.color, -1, 0), found.alpha, found.doubt], strict=True))
         cut = Image(image.path, planes, LINEAR_REC709, premultiplied=True)
-        return cut, None if mask is None else found.offset
+
+        def undistorted(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+            planes = dict(zip("RGB", np.moveaxis(rgb, -1, 0), strict=True))
+            return self._undistorted(Image(image.path, planes, LINEAR_REC709, premultiplied=False)).linear_rgb()
+
+        backdrop = Backdrop(found.scene, found.behind).mapped(undistorted)
+        return cut, None if mask is None else found.offset, backdrop
 
     def _sized(self, image: Image, what: str) -> Image:
         if (image.width, image.height) != (self.camera.width, self.camera.height):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,6 +14,24 @@ from beam_warp.checks import require_array, require_count, require_finite, requi
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.metrics import block_means
 from beam_warp.world.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """A photograph whose subject is not cut out, and what is behind the subject.
+
+    Attributes:
+        scene: Scene-linear Rec.709 of subject and backdrop, ``(H, W, 3)`` float32; of the subject alone where the
+            backdrop is not known.
+        behind: The backdrop alone, ``(H, W, 3)`` float32; 0 where it is not known.
+    """
+
+    scene: NDArray[np.float32]
+    behind: NDArray[np.float32]
+
+    def mapped(self, of: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Backdrop:
+        """Return both images after the same operation."""
+        return Backdrop(of(self.scene), of(self.behind))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -27,6 +46,7 @@ class CapturedView:
         doubt: How much is not known of a pixel, 0 to 1: its colour and coverage are a guess where a photograph does not
             tell where the subject ends, ``(H, W)`` float32; None for nothing of any.
         mask_offset: How far the file's mask reached beyond the subject before it was moved; None if nothing tells.
+        backdrop: The photograph as it was before the subject was cut out of it; None if it shows the subject alone.
 
     Raises:
         InvalidArrayError: An array has another size than the camera, or a value is not finite or out of range.
@@ -38,6 +58,7 @@ class CapturedView:
     alpha: NDArray[np.float32] | None = None
     doubt: NDArray[np.float32] | None = None
     mask_offset: MaskOffset | None = None
+    backdrop: Backdrop | None = None
 
     def __post_init__(self) -> None:
         """Check sizes and values once."""
@@ -80,13 +101,25 @@ class CapturedView:
         if (width, height) == (self.camera.width, self.camera.height):
             return self
         part = (slice(top, top + height), slice(left, left + width))
+        camera = self.camera.cropped(left, top, width, height)
+        return self._mapped(camera, lambda image: np.ascontiguousarray(image[part]))
+
+    def _mapped(self, camera: Camera, of: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> CapturedView:
+        """Return the view of another camera, each image after the same operation."""
         return replace(
             self,
-            camera=self.camera.cropped(left, top, width, height),
-            color=np.ascontiguousarray(self.color[part]),
-            alpha=None if self.alpha is None else np.ascontiguousarray(self.alpha[part]),
-            doubt=None if self.doubt is None else np.ascontiguousarray(self.doubt[part]),
+            camera=camera,
+            color=of(self.color),
+            alpha=None if self.alpha is None else of(self.alpha),
+            doubt=None if self.doubt is None else of(self.doubt),
+            backdrop=None if self.backdrop is None else self.backdrop.mapped(of),
         )
+
+    def brightened(self, factors: ArrayLike) -> CapturedView:
+        """Return the view with its light times a factor, or one for each of red, green and blue."""
+        gains = np.asarray(factors, np.float32)
+        backdrop = None if self.backdrop is None else self.backdrop.mapped(lambda image: image * gains)
+        return replace(self, color=self.color * gains, backdrop=backdrop)
 
     def reduced(self, factor: int) -> CapturedView:
         """Return the view at a lower resolution, each pixel the mean of ``factor`` x ``factor`` pixels.
@@ -106,13 +139,6 @@ class CapturedView:
         if factor == 1:
             return self
 
-        def mean(image: ArrayLike) -> NDArray[np.float32]:
-            return block_means(np.asarray(image, np.float32)[: height * factor, : width * factor], factor)
-
-        return replace(
-            self,
-            camera=self.camera.reduced(factor),
-            color=mean(self.color),
-            alpha=None if self.alpha is None else mean(self.alpha),
-            doubt=None if self.doubt is None else mean(self.doubt),
+        return self._mapped(
+            self.camera.reduced(factor), lambda image: block_means(image[: height * factor, : width * factor], factor)
         )

@@ -7,7 +7,7 @@ little of it is left to be found.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ def judge_gains(gains: ViewGains, views: Sequence[CapturedView]) -> list[Finding
 def matched(views: Sequence[CapturedView], gains: ViewGains) -> list[CapturedView]:
     """Return the views with the brightness of those that `judge_gains` names undone; the others as they are."""
     return [
-        replace(view, color=view.color * np.float32(2.0**-stops)) if is_off else view
+        view.brightened(2.0**-stops) if is_off else view
         for view, stops, is_off in zip(views, gains.stops, gains.off, strict=True)
     ]
 

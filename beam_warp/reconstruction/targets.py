@@ -20,6 +20,8 @@ from beam_warp.device.graphs import StepGraphs
 from beam_warp.errors import InvalidOptionError
 from beam_warp.kernels.common.fixed_sums import SumBuffers, launch_sum_floats
 from beam_warp.kernels.reconstruction.display_encoding import (
+    Behind,
+    behind_samples,
     launch_add_sample_gradients,
     launch_average,
     launch_believe,
@@ -154,7 +156,15 @@ class ViewTargets:
         self.height, self.width = views[0].camera.height, views[0].camera.width
         self.samples = samples
         self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
-        self._colors = [_encoded(view.color, self.device) for view in views]
+        self._colors = [
+            _encoded(view.color if view.backdrop is None else view.backdrop.scene, self.device) for view in views
+        ]
+        self._backdrops = [
+            None if view.backdrop is None else upload(view.backdrop.behind, float, self.device) for view in views
+        ]
+        self._certain = [
+            None if view.backdrop is None else upload(_certain(view), float, self.device) for view in views
+        ]
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
@@ -165,9 +175,9 @@ class ViewTargets:
         self._depth_normals = [DepthNormals(camera, device=self.device) for camera in cameras]
         # What a view is compared with lies where the one before was, so that a recorded step fits all of one kind.
         self._target, self._geometry = wp.empty_like(self._colors[0]), DepthNormals(cameras[0], device=self.device)
-        self._target_alpha, self._doubt = (
+        self._target_alpha, self._doubt, self._backdrop, self._mask = (
             next((wp.empty_like(it) for it in arrays if it is not None), None)
-            for arrays in (self._alphas, self._doubts)
+            for arrays in (self._alphas, self._doubts, self._backdrops, self._certain)
         )
         size, fine = (self.height, self.width), (cameras[0].height, cameras[0].width)
         images, adjoints = self.rasterizer.images, self.rasterizer.adjoints()
@@ -199,13 +209,15 @@ class ViewTargets:
             (self._target, self._colors[index]),
             (self._target_alpha, self._alphas[index]),
             (self._doubt, self._doubts[index]),
+            (self._backdrop, self._backdrops[index]),
+            (self._mask, self._certain[index]),
         ):
             if kept is not None:
                 wp.copy(place, kept)
 
     def kind(self, index: int) -> Hashable:
         """Return what views have in common that are compared by the same launches, when each was selected before."""
-        return self, self._alphas[index] is None, self._doubts[index] is None
+        return self, *(of[index] is None for of in (self._alphas, self._doubts, self._backdrops))
 
     def move_camera(self, index: int, camera: Camera) -> None:
         """Draw a view from another camera from now on.
@@ -231,7 +243,7 @@ class ViewTargets:
         """
         self._adjoints.zero_()
         self._to_encoded.zero_()
-        launch_average(self._color, self.samples, True, self._encoded, self.device)
+        behind = self._encode(index)
         target, doubt = self._target, None if self._doubts[index] is None else self._doubt
         launch_believe(doubt, target, self._encoded, self.device)
         terms = [self._l1(self._encoded, target, weight=weights.l1, gradient=self._to_encoded, value=values)]
@@ -240,14 +252,19 @@ class ViewTargets:
                 self._ssim(self._encoded, target, weight=weights.ssim, gradient=self._to_encoded, value=values)
             )
         launch_believe(doubt, None, self._to_encoded, self.device)
-        launch_add_sample_gradients(self._color, self.samples, True, self._to_encoded, self._to_color, self.device)
+        launch_add_sample_gradients(
+            self._color, self.samples, True, self._to_encoded, self._to_color, self.device, behind, self._to_alpha
+        )
         alpha = None if self._alphas[index] is None else self._target_alpha
         if alpha is not None and weights.alpha > 0.0:
             self._to_covered.zero_()
             launch_average(self._alpha, self.samples, False, self._covered, self.device)
             launch_believe(doubt, alpha, self._covered, self.device)
+            mask = None if self._certain[index] is None else self._mask
             terms.append(
-                self._l1_alpha(self._covered, alpha, weight=weights.alpha, gradient=self._to_covered, value=values)
+                self._l1_alpha(
+                    self._covered, alpha, weight=weights.alpha, mask=mask, gradient=self._to_covered, value=values
+                )
             )
             launch_believe(doubt, None, self._to_covered, self.device)
             launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
@@ -268,6 +285,13 @@ class ViewTargets:
             )
             self._geometry.add_gradients(self._depth, self._coverage, self._to_surface, self._to_depth)
         return terms
+
+    def _encode(self, index: int) -> Behind:
+        """Encode what was drawn last, before the backdrop of a view that was selected; return that."""
+        backdrop = None if self._backdrops[index] is None else self._backdrop
+        behind = behind_samples(backdrop, self._alpha)
+        launch_average(self._color, self.samples, True, self._encoded, self.device, behind)
+        return behind
 
     def shares(self, index: int, gaussians: GaussianArrays) -> NDArray[np.float32]:
         """Return what each Gaussian shows of itself in a view: its weights summed over the pixels, ``(N,)`` [pixel]."""
@@ -293,7 +317,7 @@ class ViewTargets:
 
     def write_error(self, index: int, out: wp.array) -> None:
         """Write the mean square error of what was drawn last against a view to ``out[0]``, encoded and clipped."""
-        launch_average(self._color, self.samples, True, self._encoded, self.device)
+        self._encode(index)
         launch_square_error(self._errors.size, self._encoded, self._colors[index], self._errors, self.device)
         launch_sum_floats(self._errors, 1.0 / (3 * self.height * self.width), self._sums, out, self.device)
 
@@ -333,7 +357,7 @@ class ViewTargets:
         alpha = self._alphas[index]
         assert alpha is not None
         assert self.samples == 1
-        launch_average(self._color, self.samples, True, self._encoded, self.device)
+        self._encode(index)
         drawn = np.dstack([self._encoded.numpy(), self._alpha.numpy()])
         photograph = np.dstack([self._colors[index].numpy(), alpha.numpy()])
         doubt = self._doubts[index]
@@ -355,6 +379,17 @@ class ViewTargets:
         parts, count = labelled
         largest = np.bincount(parts.ravel())[1:].max() if count else 0
         return largest / max(self._subjects[index], 1)
+
+
+def _certain(view: CapturedView) -> NDArray[np.float32]:
+    """Return 0 where a view's outline runs before a known backdrop, 1 elsewhere, ``(H, W)``.
+
+    There, what is seen of both says where the subject ends, and the matte, which was made of it, says it less well.
+    """
+    assert view.alpha is not None
+    assert view.backdrop is not None
+    is_outline = (ndimage.maximum_filter(view.alpha, 3) > 0.0) & (ndimage.minimum_filter(view.alpha, 3) < 1.0)
+    return 1.0 - (is_outline & view.backdrop.behind.any(axis=-1)).astype(np.float32)
 
 
 def _encoded(color: NDArray[np.float32], device: Any) -> wp.array:

@@ -24,13 +24,31 @@ def mean_sample(samples: wp.array3d[float], y: int, x: int, channel: int, factor
     return total / float(factor * factor)
 
 
+@wp.struct
+class Behind:
+    """What samples lie before; arrays have length 0 where that is nothing."""
+
+    color: wp.array3d[float]  # linear, of each pixel
+    alpha: wp.array3d[float]  # of each sample
+
+
+@wp.func
+def behind_pixel(behind: Behind, y: int, x: int, channel: int, factor: int) -> float:
+    value = float(0.0)
+    if behind.color.shape[0] > 0:
+        value = (1.0 - mean_sample(behind.alpha, y, x, 0, factor)) * behind.color[y, x, channel]
+    return value
+
+
 @wp.kernel
-def average_kernel(first: int, samples: wp.array3d[float], factor: int, is_color: bool, out_means: wp.array3d[float]):
+def average_kernel(
+    first: int, samples: wp.array3d[float], factor: int, is_color: bool, behind: Behind, out_means: wp.array3d[float]
+):
     item = first + wp.tid()
     y = item / out_means.shape[1]
     x = item % out_means.shape[1]
     for channel in range(out_means.shape[2]):
-        value = mean_sample(samples, y, x, channel, factor)
+        value = mean_sample(samples, y, x, channel, factor) + behind_pixel(behind, y, x, channel, factor)
         shown = value
         if is_color:
             shown = 12.92 * value
@@ -45,23 +63,32 @@ def add_sample_gradients_kernel(
     samples: wp.array3d[float],
     factor: int,
     is_color: bool,
+    behind: Behind,
     gradients: wp.array3d[float],
     out_gradients: wp.array3d[float],
+    out_to_alpha: wp.array3d[float],
 ):
     item = first + wp.tid()
     y = item / gradients.shape[1]
     x = item % gradients.shape[1]
+    hidden = float(0.0)
     for channel in range(gradients.shape[2]):
         slope = float(1.0)
         if is_color:
             slope = 12.92
-            value = mean_sample(samples, y, x, channel, factor)
+            value = mean_sample(samples, y, x, channel, factor) + behind_pixel(behind, y, x, channel, factor)
             if value > KNEE:
                 slope = (1.055 / 2.4) * wp.pow(value, 1.0 / 2.4 - 1.0)
         share = slope * gradients[y, x, channel] / float(factor * factor)
         for j in range(factor):
             for i in range(factor):
                 out_gradients[y * factor + j, x * factor + i, channel] += share
+        if behind.color.shape[0] > 0:
+            hidden += share * behind.color[y, x, channel]
+    if behind.color.shape[0] > 0:
+        for j in range(factor):
+            for i in range(factor):
+                out_to_alpha[y * factor + j, x * factor + i, 0] -= hidden
 
 
 @wp.kernel
@@ -88,19 +115,42 @@ def square_error_kernel(first: int, encoded: wp.array3d[float], target: wp.array
     out_errors[item] = total
 
 
-def launch_average(samples: Any, factor: int, is_color: bool, out_means: Any, device: Any) -> None:
-    """Average ``factor`` x ``factor`` samples a pixel, ``(H f, W f, C)``, and encode colours; arrays may be strided."""
+def behind_samples(color: Any = None, alpha: Any = None) -> Behind:
+    """Return what samples lie before: linear colour of each pixel, and their own alpha; nothing without."""
+    behind = Behind()
+    if color is not None:
+        behind.color, behind.alpha = color, alpha
+    return behind
+
+
+NOTHING = behind_samples()
+
+
+def launch_average(
+    samples: Any, factor: int, is_color: bool, out_means: Any, device: Any, behind: Behind = NOTHING
+) -> None:
+    """Average ``factor`` x ``factor`` samples a pixel, ``(H f, W f, C)``, and encode colours; arrays may be strided.
+
+    What is behind shows as far as samples let it through.
+    """
     pixels = out_means.shape[0] * out_means.shape[1]
-    launch(average_kernel, pixels, inputs=[samples, factor, is_color], outputs=[out_means], device=device)
+    launch(average_kernel, pixels, inputs=[samples, factor, is_color, behind], outputs=[out_means], device=device)
 
 
 def launch_add_sample_gradients(
-    samples: Any, factor: int, is_color: bool, gradients: Any, out_gradients: Any, device: Any
+    samples: Any,
+    factor: int,
+    is_color: bool,
+    gradients: Any,
+    out_gradients: Any,
+    device: Any,
+    behind: Behind = NOTHING,
+    to_alpha: Any = None,
 ) -> None:
-    """Add the gradients of linear samples, given those of what `launch_average` writes."""
+    """Add the gradients of linear samples and of their alpha, given those of what `launch_average` writes."""
     pixels = gradients.shape[0] * gradients.shape[1]
-    inputs = [samples, factor, is_color, gradients]
-    launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients], device=device)
+    inputs = [samples, factor, is_color, behind, gradients]
+    launch(add_sample_gradients_kernel, pixels, inputs=inputs, outputs=[out_gradients, to_alpha], device=device)
 
 
 def launch_believe(doubt: Any, known: Any, out_values: Any, device: Any) -> None:

@@ -10,9 +10,10 @@ from reference.activation import activate, thin_axes
 from reference.depth_normals import depth_normals, has_normal
 from reference.raster_splats import RasterScene
 from reference.rasterizing import decide, replay
+from scipy import ndimage
 from support.moving_ball import ball_cloud, ball_views, block_means, rig
 
-from beam_warp.capture.views import CapturedView
+from beam_warp.capture.views import Backdrop, CapturedView
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
 from beam_warp.raster.depth_normals import LARGEST_JUMP, STEEPEST
 from beam_warp.raster.gbuffer import rasterize
@@ -137,6 +138,15 @@ def random_view(rng, camera):
     return CapturedView(name="a", camera=camera, color=rng.uniform(size=(*size, 3)), alpha=alpha)
 
 
+def with_backdrop(rng, view):
+    """The same before a backdrop that is known in two thirds of the columns; the first columns are solid."""
+    alpha = view.alpha.copy()
+    alpha[:, :4] = 1.0
+    scene, behind = rng.uniform(size=(2, *view.color.shape)).astype(np.float32)
+    behind[:, ::3] = 0.0
+    return replace(view, alpha=alpha, backdrop=Backdrop(scene, behind))
+
+
 def set_up(views, cloud, device, samples=1, kind=TargetSet, **options):
     """Targets and the Gaussians to draw for them."""
     target = wp.get_device(device)
@@ -180,15 +190,23 @@ class Twin:
     def loss(self, **changed):
         drawn = replay(self.scene({**self.rows, **changed}), self.decisions)
         weights, everywhere = self.weights, np.ones(self.view.alpha.shape)
-        color = encode(block_means(drawn.channels, self.samples))
-        target = linear_to_srgb(self.view.color.astype(np.float64))
+        linear, covered = block_means(drawn.channels, self.samples), block_means(drawn.alpha, self.samples)
+        target, compared = self.view.color.astype(np.float64), everywhere
+        if self.view.backdrop is not None:
+            target = self.view.backdrop.scene.astype(np.float64)
+            linear = linear + (1.0 - covered) * self.view.backdrop.behind.astype(np.float64)
+            edges = (ndimage.maximum_filter(self.view.alpha, 3) > 0.0) & (
+                ndimage.minimum_filter(self.view.alpha, 3) < 1.0
+            )
+            compared = everywhere - (edges & (self.view.backdrop.behind > 0.0).any(axis=-1))
+        color, target = encode(linear), linear_to_srgb(target)
         trust = (everywhere if self.view.doubt is None else 1.0 - self.view.doubt.astype(np.float64))[..., None]
         color = target + trust * (color - target)
         total = weights.l1 * image_losses.l1(color, target, everywhere)
         total += weights.ssim * image_losses.ssim(color, target, everywhere)
         known = self.view.alpha[..., None].astype(np.float64)
-        alpha = known + trust * (block_means(drawn.alpha, self.samples) - known)
-        total += weights.alpha * image_losses.l1(alpha, known, everywhere)
+        alpha = known + trust * (covered - known)
+        total += weights.alpha * image_losses.l1(alpha, known, compared)
         surface = depth_normals(drawn.depth, self.view.camera.supersampled(self.samples), self.found)
         return total + weights.normal * image_losses.normal(
             drawn.normals, surface, self.mask, weights.normal_tolerance or np.inf
@@ -199,14 +217,16 @@ class Twin:
 
 
 @pytest.mark.parametrize(
-    ("size", "samples", "weights", "is_doubted"),
+    ("size", "samples", "weights", "is_doubted", "has_backdrop"),
     [
-        ((19, 14), 1, LossWeights(normal=0.3), False),
-        ((17, 11), 2, LossWeights(normal=0.3, normal_tolerance=0.1), True),
-        ((19, 14), 2, LossWeights(l1=0.0, ssim=0.0, alpha=0.0, normal=1.0), False),
+        ((19, 14), 1, LossWeights(normal=0.3), False, False),
+        ((17, 11), 2, LossWeights(normal=0.3, normal_tolerance=0.1), True, False),
+        ((19, 14), 2, LossWeights(l1=0.0, ssim=0.0, alpha=0.0, normal=1.0), False, False),
+        ((17, 11), 2, LossWeights(normal=0.3), True, True),
+        ((19, 14), 1, LossWeights(ssim=0.0), False, True),
     ],
 )
-def test_the_gradient_of_a_step_is_that_of_its_loss(device, size, samples, weights, is_doubted):
+def test_the_gradient_of_a_step_is_that_of_its_loss(device, size, samples, weights, is_doubted, has_backdrop):
     """Encoding, samples, four terms, rasteriser and activation at once: from photographs to the parameters.
 
     1e-5 of every gradient's length is the goal that all gradients here have; 3.5e-6 was the most in twelve scenes.
@@ -215,6 +235,8 @@ def test_the_gradient_of_a_step_is_that_of_its_loss(device, size, samples, weigh
     view = random_view(rng, camera_of(*size))
     if is_doubted:
         view = replace(view, doubt=np.random.default_rng(4).uniform(size=view.alpha.shape))
+    if has_backdrop:
+        view = with_backdrop(np.random.default_rng(5), view)
     targets, parameters = set_up([view], near_cloud(rng), device, samples, ViewTargets, sh_degree=1)
     filters = rng.uniform(0.0, 0.1, 6).astype(np.float32)
     parameters.filters.assign(filters)
@@ -232,6 +254,28 @@ def test_the_gradient_of_a_step_is_that_of_its_loss(device, size, samples, weigh
         expected, found = twin.gradient(name), parameters.gradient(name).numpy()
         errors[name] = np.linalg.norm(found - expected) / max(np.linalg.norm(expected), 1e-12)
     assert max(errors.values()) <= 1e-5, errors
+
+
+def test_before_a_known_backdrop_a_wrong_matte_moves_no_outline(device):
+    """What is drawn is the scene: nothing pulls at it, though the matte is too large; the cut-out alone does."""
+    (view,) = ball_views(rig(1))
+    cloud, behind = ball_cloud(60), np.float32([0.2, 0.3, 0.4])
+    targets, parameters = set_up([view], cloud, device, kind=ViewTargets)
+    targets.draw(0, parameters.drawn)
+    images = targets.rasterizer.images
+    size, colors = view.alpha.shape, targets.rasterizer.color_channels
+    color, alpha = images.channels[0].numpy()[:, colors.start : colors.stop].reshape(*size, 3), images.alpha.numpy()
+    alpha = alpha.reshape(size)
+    grown = ndimage.maximum_filter(alpha, 3)
+    wrong = replace(view, color=color, alpha=grown)
+    scene = color + (1.0 - alpha)[..., None] * behind
+    pulls = []
+    for given in (wrong, replace(wrong, backdrop=Backdrop(scene, np.broadcast_to(behind, scene.shape)))):
+        targets, parameters = set_up([given], cloud, device, kind=ViewTargets)
+        targets.draw(0, parameters.drawn)
+        targets.add_losses(0, LossWeights(l1=1.0, ssim=0.0, alpha=1.0))
+        pulls.append(np.abs(targets.rasterizer.adjoints().alpha.numpy()).sum())
+    assert pulls[1] < 0.02 * pulls[0]
 
 
 def test_terms_that_count_nothing_ask_for_nothing(device):

@@ -8,7 +8,11 @@ from support.kernel_runs import upload_floats as upload
 from support.moving_ball import block_means
 
 from beam_warp.image.color import linear_to_srgb
-from beam_warp.kernels.reconstruction.display_encoding import launch_add_sample_gradients, launch_average
+from beam_warp.kernels.reconstruction.display_encoding import (
+    behind_samples,
+    launch_add_sample_gradients,
+    launch_average,
+)
 
 KNEE = 0.0031308
 
@@ -55,6 +59,29 @@ class TestImages:
         samples = rng.gamma(0.5, 0.5, (size[0] * factor, size[1] * factor, 3)).astype(np.float32)
         expected = linear_to_srgb(means(samples, factor))
         np.testing.assert_allclose(averaged(samples, factor, device, bring), expected, rtol=ROUNDINGS * EPSILON)
+
+    def test_what_is_behind_shows_through(self, device, rng, size, factor, bring):
+        """Means of colour and alpha lie before one colour a pixel; gradients reach both."""
+        fine = (size[0] * factor, size[1] * factor)
+        samples = rng.gamma(0.5, 0.5, (*fine, 3)).astype(np.float32)
+        alpha = rng.uniform(size=(*fine, 1)).astype(np.float32)
+        color, upstream = (
+            rng.uniform(size=(*size, 3)).astype(np.float32),
+            rng.normal(size=(*size, 3)).astype(np.float32),
+        )
+        values = means(samples, factor) + (1.0 - means(alpha, factor)) * color
+        behind = behind_samples(upload(color, device), bring(alpha, device))
+        out, to_samples, to_alpha = (
+            wp.zeros(shape, dtype=float, device=device) for shape in (color.shape, (*fine, 3), (*fine, 1))
+        )
+        launch_average(bring(samples, device), factor, True, out, device, behind)
+        np.testing.assert_allclose(out.numpy(), linear_to_srgb(values), rtol=2 * ROUNDINGS * EPSILON)
+        given = bring(samples, device), factor, True, upload(upstream, device), to_samples, device, behind, to_alpha
+        launch_add_sample_gradients(*given)
+        share = slopes(values) * upstream / factor**2
+        for found, expected in ((to_samples, share), (to_alpha, -(share * color).sum(axis=-1, keepdims=True))):
+            expected = expected.repeat(factor, axis=0).repeat(factor, axis=1)
+            np.testing.assert_allclose(found.numpy(), expected, rtol=1e-4, atol=1e-5 * np.abs(share).max())
 
     def test_average(self, device, rng, size, factor, bring):
         samples = rng.uniform(size=(size[0] * factor, size[1] * factor, 1)).astype(np.float32)
