@@ -41,6 +41,9 @@ CROP_MARGIN = 8
 CROP_STEP = 16
 """Sides of crops are multiples of a tile of the rasteriser [pixel]."""
 
+MATTE_SHARE = 0.4
+"""Part of the weight of coverage that counts where the backdrop is known: the photograph says what a matte guesses."""
+
 MOST_SAMPLES = 4
 """Largest side of the square of samples of a pixel."""
 
@@ -162,9 +165,6 @@ class ViewTargets:
         self._backdrops = [
             None if view.backdrop is None else upload(view.backdrop.behind, float, self.device) for view in views
         ]
-        self._certain = [
-            None if view.backdrop is None else upload(_certain(view), float, self.device) for view in views
-        ]
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
@@ -175,9 +175,9 @@ class ViewTargets:
         self._depth_normals = [DepthNormals(camera, device=self.device) for camera in cameras]
         # What a view is compared with lies where the one before was, so that a recorded step fits all of one kind.
         self._target, self._geometry = wp.empty_like(self._colors[0]), DepthNormals(cameras[0], device=self.device)
-        self._target_alpha, self._doubt, self._backdrop, self._mask = (
+        self._target_alpha, self._doubt, self._backdrop = (
             next((wp.empty_like(it) for it in arrays if it is not None), None)
-            for arrays in (self._alphas, self._doubts, self._backdrops, self._certain)
+            for arrays in (self._alphas, self._doubts, self._backdrops)
         )
         size, fine = (self.height, self.width), (cameras[0].height, cameras[0].width)
         images, adjoints = self.rasterizer.images, self.rasterizer.adjoints()
@@ -210,7 +210,6 @@ class ViewTargets:
             (self._target_alpha, self._alphas[index]),
             (self._doubt, self._doubts[index]),
             (self._backdrop, self._backdrops[index]),
-            (self._mask, self._certain[index]),
         ):
             if kept is not None:
                 wp.copy(place, kept)
@@ -260,12 +259,8 @@ class ViewTargets:
             self._to_covered.zero_()
             launch_average(self._alpha, self.samples, False, self._covered, self.device)
             launch_believe(doubt, alpha, self._covered, self.device)
-            mask = None if self._certain[index] is None else self._mask
-            terms.append(
-                self._l1_alpha(
-                    self._covered, alpha, weight=weights.alpha, mask=mask, gradient=self._to_covered, value=values
-                )
-            )
+            weight = weights.alpha * (1.0 if self._backdrops[index] is None else MATTE_SHARE)
+            terms.append(self._l1_alpha(self._covered, alpha, weight=weight, gradient=self._to_covered, value=values))
             launch_believe(doubt, None, self._to_covered, self.device)
             launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
         if weights.normal > 0.0:
@@ -379,17 +374,6 @@ class ViewTargets:
         parts, count = labelled
         largest = np.bincount(parts.ravel())[1:].max() if count else 0
         return largest / max(self._subjects[index], 1)
-
-
-def _certain(view: CapturedView) -> NDArray[np.float32]:
-    """Return 0 where a view's outline runs before a known backdrop, 1 elsewhere, ``(H, W)``.
-
-    There, what is seen of both says where the subject ends, and the matte, which was made of it, says it less well.
-    """
-    assert view.alpha is not None
-    assert view.backdrop is not None
-    is_outline = (ndimage.maximum_filter(view.alpha, 3) > 0.0) & (ndimage.minimum_filter(view.alpha, 3) < 1.0)
-    return 1.0 - (is_outline & view.backdrop.behind.any(axis=-1)).astype(np.float32)
 
 
 def _encoded(color: NDArray[np.float32], device: Any) -> wp.array:
