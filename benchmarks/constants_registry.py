@@ -28,6 +28,7 @@ EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 SCENE_LINEAR = "the captures are scene-linear, so that no exposure is looked for"
 FAR_MOTION = "only motion beyond the reach of reduced images uses it, which these frames do not have"
 NO_SCORE = "it decides what is reported, and moves no score"
+ONE_FRAME = "the runs have one frame or two, of which none is left out"
 BINARY = "a list of powers of two"
 
 
@@ -78,6 +79,7 @@ TRACK = "beam_warp.reconstruction.track:"
 JOINTS = "beam_warp.reconstruction.joint_tracking:"
 FAR = "beam_warp.reconstruction.far_motion:"
 REGISTRATION = "beam_warp.reconstruction.joints.registration:"
+ROUGH = "beam_warp.decomposition.roughness_finder:"
 EVIDENCE = "beam_warp.materials.evidence:"
 ROUGHNESS = "beam_warp.materials.roughness:"
 RESIDUES = "beam_warp.kernels.materials.residues:"
@@ -248,6 +250,10 @@ MATERIALS = (
     Constant("beam_warp.materials.light_rays:MaterialOptions.light_error", BOTH, "Error at which rays are as many."),
     Constant("beam_warp.materials.pilot:REACH", BOTH, "Neighbours whose rays tell how many a Gaussian needs."),
     Constant("beam_warp.materials.light_rays:BOUNCE_PART", BOTH, "Rays for one of the bounce."),
+    Constant(ROUGH + "ROUGHNESS_FRAMES", WALKER, "Most frames that roughness is found from.", ONE_FRAME),
+    Constant(ROUGH + "PART", JUDGED, "Part of its error by which left-out frames may change roughness.", ONE_FRAME),
+    Constant(ROUGH + "PILOT_GAUSSIANS", JUDGED, "Gaussians that tell whether views say anything of roughness."),
+    Constant(ROUGH + "LEAST_SAVED", JUDGED, "How many times as many Gaussians a frame has for a pilot."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
     Constant("beam_warp.materials.normals:LAYER_REACH", JUDGED, "How far from the surface a Gaussian is of a layer."),
     Constant("beam_warp.materials.normals:FACE_SPREAD", BOTH, "Normals of one face, beside an edge [rad]."),

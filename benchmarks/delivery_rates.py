@@ -1,4 +1,4 @@
-"""Kilobytes a frame of the delivery container against what relit images lose, over takes of 24 frames.
+"""Kilobytes a frame of containers and of keyed assets against what relit images lose, over takes of 24 frames.
 
     python benchmarks/delivery_rates.py [--quick] [--made FOLDER] --out result.json
 
@@ -11,6 +11,10 @@ Takes have as many Gaussians as a user would deliver:
 Each is written as a container at several factors of the bounds, as it is and after `beam reduce`. The loss is that of
 relit images against the truth: PSNR of the take less PSNR of what the container gives back. Lights and cameras of the
 truth are none that a search saw.
+
+``dance``, ``calm`` and ``walk`` (by ``--parts``) are takes as USD assets, with a time sample at every frame and with
+keys at several factors of the bounds: the dancer, the same three times as slow, and the walker, whose asset may have
+any number of Gaussians. The loss that is counted as `beam reduce` does is that of draws of its distribution.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ import functools
 import json
 import sys
 import tempfile
+import time
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -29,23 +34,30 @@ from typing import Any
 
 import numpy as np
 import record
-from delivery_take import FRAMES_PER_SECOND, take
+from delivery_take import DANCE_SECONDS, FRAMES_PER_SECOND, take
 from parts import measure_all, say
+from pxr import Usd
 from walking_take import FRAMES_PER_SECOND as WALKED_PER_SECOND
 from walking_take import SkinnedModel, walk
 
 from beam_warp.capture.capture import Capture
 from beam_warp.converters import WriteOptions, read, write
+from beam_warp.converters.common.bounds import bounds_of
 from beam_warp.converters.delivery.decoder import Container
 from beam_warp.demo.figure import build_figure
 from beam_warp.demo.lights import demo_environments
 from beam_warp.device.arrays import resolve_device
 from beam_warp.evaluate.materials import EvaluateOptions, score_materials
+from beam_warp.evaluate.relit import RelitComparison
+from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.image.metrics import compare
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reduction.job import ReduceOptions, Reducer
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import UNSHADOWED
+from beam_warp.schema.keys import departure
+from beam_warp.schema.layout import CHANNELS
+from beam_warp.schema.stage_queries import array_attribute, splat_prims
 from beam_warp.trace.mesh_paths import TracedMesh, trace_radiance
 from beam_warp.world.axes import change_axes
 from beam_warp.world.camera import Camera
@@ -59,6 +71,9 @@ Score = Callable[[GaussianSequence], float]
 LIGHTS = ("sunset", "stage")
 SEEN = ((0, 25.0, 8.0), (13, 160.0, 20.0), (23, 290.0, 35.0))
 """Frames of the figure that are judged, with azimuth and elevation of the camera [degree]."""
+
+KEYED = ("positions", "orientations", "normals", "ambient_occlusion", "radiance")
+"""Arrays of these takes that change."""
 
 WALKER_FRAMES = (0, 4)
 """Frames of the capture whose true images are known."""
@@ -77,11 +92,13 @@ class Bench:
     options: ReduceOptions
     made: Path | None
     data: Path
+    keyed_count: int = 30_000
+    draws: int = 48
 
 
-def figure(bench: Bench) -> tuple[GaussianSequence, Score]:
+def figure(bench: Bench, period: float = DANCE_SECONDS) -> tuple[GaussianSequence, Score]:
     """Return the dancer, and what scores it against path-traced images."""
-    frames = list(take(build_figure(), bench.count, bench.frames))
+    frames = list(take(build_figure(), bench.count, bench.frames, period=period))
     raster = RasterOptions(antialiased=True)
     clouds = [cloud for _, cloud in frames]
     facts = {"frames_per_second": FRAMES_PER_SECOND, "metadata": raster.as_metadata()}
@@ -180,18 +197,65 @@ def rates(name: str, made: Callable[[Bench], tuple[GaussianSequence, Score]], be
                 yield {"psnr": truth, "frames": bench.frames, "rows": rows}
 
 
+def keys(name: str, made: Callable[[Bench], tuple[GaussianSequence, Score]], bench: Bench) -> Iterator[Row]:
+    """Write a take with a time sample at every frame, and with keys at every factor of the bounds."""
+    original, score = made(replace(bench, count=bench.keyed_count))
+    trials = RelitTrials(list(demo_environments().values()), height=bench.options.height)
+    draws = trials.draw("certificate", range(bench.draws), range(len(original)))
+    comparison, bounds, truth = RelitComparison(original, trials), bounds_of(original[0]), score(original)
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="beam_keys_") as folder:
+        every = Path(folder) / "every.usdc"
+        for factor in (None, *bench.factors):
+            path = every if factor is None else every.with_stem(f"keys_{factor:g}")
+            options = WriteOptions() if factor is None else WriteOptions(keyed=True, error_scale=factor)
+            started = time.process_time()
+            write(original, path, options)
+            seconds, back = (time.process_time() - started) / bench.frames, read(path)
+            losses = comparison.errors(back, draws, keep=True).values("loss")
+            row: Row = {"name": f"{factor}", "factor": factor, "kb_a_frame": path.stat().st_size / 1e3 / bench.frames}
+            row |= {"write_seconds_a_frame": seconds, "samples": samples_of(path), "loss": truth - score(back)}
+            row |= {"counted_mean": float(losses.mean()), "counted_worst": float(losses.max())}
+            if factor is not None:
+                row["of_bound"] = {n: far / factor / bounds[n] for n, far in departures(back, read(every)).items()}
+            rows.append(row)
+            say(f"{name} {row}")
+            yield {"psnr": truth, "frames": bench.frames, "gaussians": len(original[0]), "rows": rows}
+
+
+def samples_of(path: Path) -> dict[str, int]:
+    """Return how many time samples the arrays of an asset have, those that change."""
+    stage = Usd.Stage.Open(str(path))
+    found = {each.name: array_attribute(splat_prims(stage)[0], each) for each in CHANNELS.values()}
+    counts = {name: attribute.GetNumTimeSamples() for name, attribute in found.items() if attribute is not None}
+    return {name: max(count, 1) for name, count in counts.items() if name in KEYED}
+
+
+def departures(back: GaussianSequence, every: GaussianSequence) -> dict[str, float]:
+    """Return how far the arrays of an asset are from those that have a sample at every frame, in the worst frame."""
+    pairs = [(one.arrays(), other.arrays()) for one, other in zip(back, every, strict=True)]
+    names = [name for name in KEYED if name in pairs[0][0]]
+    return {name: max(departure(name, one[name], other[name]) for one, other in pairs) for name in names}
+
+
 PARTS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     made.__name__: functools.partial(rates, made.__name__, made) for made in (figure, walker)
+}
+KEYED_PARTS: dict[str, Callable[[Bench], Iterator[Row]]] = {
+    "dance": functools.partial(keys, "dance", figure),
+    "calm": functools.partial(keys, "calm", functools.partial(figure, period=3.0 * DANCE_SECONDS)),
+    "walk": functools.partial(keys, "walk", walker),
 }
 
 
 def main() -> int:
-    parser = record.parser(__doc__, quick="a small figure of few frames", parts=PARTS, data=True)
+    every = PARTS | KEYED_PARTS
+    parser = record.parser(__doc__, quick="a small figure of few frames", parts=every, data=True)
     parser.add_argument("--made", type=Path, metavar="FOLDER", help="where walker.usdc is")
     arguments = parser.parse_args()
     bench = _bench(arguments)
-    without = ("figure",) if arguments.made is None else ()
-    return measure_all(PARTS, bench, arguments, resolve_device(None), arguments.parts or without)
+    usual = ("figure",) if arguments.made is None else tuple(PARTS)
+    return measure_all(every, bench, arguments, resolve_device(None), arguments.parts or usual)
 
 
 def _bench(arguments: argparse.Namespace) -> Bench:
@@ -199,7 +263,7 @@ def _bench(arguments: argparse.Namespace) -> Bench:
     paths: Row = {"made": arguments.made, "data": arguments.data}
     if arguments.quick:
         options = replace(options, height=48, views=4, steps=4)
-        return Bench(800, 3, 60, 4, (1.0, 0.3), (1.0, 4.0), options, **paths)
+        return Bench(800, 3, 60, 4, (1.0, 0.3), (1.0, 4.0), options, keyed_count=800, draws=4, **paths)
     return Bench(140_000, 24, 400, 64, (1.0, 0.25), (1.0, 2.0, 4.0, 8.0), options, **paths)
 
 

@@ -35,8 +35,18 @@ NORMAL_NOISE = 0.02
 FloatArray = NDArray[np.float64]
 
 
-def take(figure: Figure, count: int, frames: int, seed: int = 0) -> Iterator[tuple[MaterialMesh, GaussianCloud]]:
-    """Yield the frames of a take: the surface, and the Gaussians on it, with the noise that estimates leave."""
+def take(
+    figure: Figure, count: int, frames: int, seed: int = 0, period: float = DANCE_SECONDS
+) -> Iterator[tuple[MaterialMesh, GaussianCloud]]:
+    """Yield the frames of a take: the surface, and the Gaussians on it, with the noise that estimates leave.
+
+    Args:
+        figure: Who dances.
+        count: Number of Gaussians.
+        frames: Number of frames.
+        seed: Of the noise.
+        period: Period of the dance [s].
+    """
     rng = np.random.default_rng(seed)
     samples = sample_surface(figure.rest, count, rng)
     coarse = sample_surface(figure.rest, AO_GAUSSIANS, np.random.default_rng(1))
@@ -49,7 +59,7 @@ def take(figure: Figure, count: int, frames: int, seed: int = 0) -> Iterator[tup
         for name in ("base_color", "roughness")
     }
     for frame in range(frames):
-        mesh = figure.at(frame / FRAMES_PER_SECOND / DANCE_SECONDS)
+        mesh = figure.at(frame / FRAMES_PER_SECOND / period)
         left, _, right = np.linalg.svd(_shapes(mesh, samples.faces) @ start)
         turned = left @ right
         points = mesh.interpolate(mesh.vertices, samples.faces, samples.weights)

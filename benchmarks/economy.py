@@ -1,6 +1,6 @@
 """What do rays bring where they are needed, instead of as many for every Gaussian: error, bias, time and scores?
 
-    python benchmarks/economy.py [--device cuda:0] [--parts light occlusion bounce] --out JSON
+    python benchmarks/economy.py [--device cuda:0] [--parts light occlusion bounce frames views] --out JSON
 
 Materials of Gaussians on the true surface of three captures and of the demo's are measured with every Gaussian's light
 by as many rays, and by as many as its neighbours' first rays say that it needs. Errors are of the arriving light at
@@ -9,29 +9,38 @@ rays for each have the same error, between those that were measured. *Stopped* i
 once its own rays agree; and *occlusion* is what the same rule would bring there. Both are looked up in the runs with as
 many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn. *Bounce* is
 the error of the bounced light over all light: without it, by as many rays for each, and by as many as it needs.
+*Frames* is roughness of Gaussians that keep their places on the surface, from all frames and from as many as change it,
+and that of two views, which say nothing of it. *Views* is base colour by all training views and
+by some; its change is relative to the error that it states with all. Seconds of both are those of the processor.
 """
 
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import record
+from constants_places import changed
 from materials_truth import Materials, PerfectFrame, TruthViews, light_reference
 from numpy.typing import NDArray
 from timing import Task, spread, take_turns
 
 from beam_warp.capture.capture import Capture
+from beam_warp.decomposition import roughness_finder
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.image.metrics import root_mean_square
+from beam_warp.jobs.progress import JobLog
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.base_color import fill_from_neighbors, solve_base_color
 from beam_warp.materials.direct import MaterialMeasurement, measure_materials
+from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light_rays import (
     BOUNCE_PART,
     LitPoints,
@@ -40,11 +49,13 @@ from beam_warp.materials.light_rays import (
     lit_points,
     mean_radiance,
 )
+from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.pilot import rays_needed
-from beam_warp.reconstruction.scores import truth_frames
-from beam_warp.study.true_surface import SHARP
+from beam_warp.reconstruction.scores import read_truth_mesh, truth_frames
+from beam_warp.study.true_surface import SHARP, colored_by_views, gaussians_on_mesh
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_batches
+from beam_warp.trace.scene import Scene
 from beam_warp.world.environment import EnvironmentMap
 
 CAPTURES = ("walker", "runner", "robot", "demo")
@@ -52,6 +63,10 @@ FIXED = (16, 32, 64, 128, 256)
 TARGETS = (0.025, 0.05, 0.1, 0.2)
 OCCLUSION_TARGETS = (0.01, 0.02, 0.04)
 REPEATS = 5
+VIEW_SHARES = (1.0, 0.75, 0.5)
+
+MUTE_GAUSSIANS = 40_000
+"""Gaussians that two views see: enough for a pilot."""
 
 Errors = Mapping[int, NDArray[np.floating[Any]]]
 """Errors of Gaussians by rays for each."""
@@ -209,7 +224,100 @@ def bounce_of(subject: Subject, rays: int, device: Any, repeats: int) -> list[di
     return rows
 
 
-PARTS = ("light", "occlusion", "bounce")
+def frames_of(capture: Capture, count: int, device: Any) -> list[dict[str, Any]]:
+    """Return roughness from all frames, and from as many as change it, of Gaussians that keep their places."""
+    numbers = sorted({record.frame for record in capture.select(split="train")})
+    assert capture.environment_path is not None
+    light = PreparedEnvironment(EnvironmentMap.read(capture.environment_path), device)
+    seen = [seen_frame(capture, number, numbers[0], count, device) for number in numbers]
+    truth = PerfectFrame(capture, numbers[0], seen[0].cloud, seen[0].scene, (), seen[0].views).true_roughness(device)
+    rows = []
+    for name, part in (("all frames", 0.0), ("as many as change it", roughness_finder.PART)):
+        with changed("beam_warp.decomposition.roughness_finder:PART", part):
+            rows.append(roughness_row(name, seen, light) | {"of": len(seen)})
+        off = (rows[-1]["found"].roughness - truth)[seen[0].points.seen]
+        rows[-1]["psnr"] = float(-20.0 * np.log10(root_mean_square(off)))
+    silent = seen_frame(capture, numbers[0], numbers[0], max(count, MUTE_GAUSSIANS), device)
+    two = {key: getattr(silent.views, key)[:2].contiguous() for key in ("colors", "directions")}
+    silent.views = replace(silent.views, **two)
+    for name, saved in (("two views, no pilot", 10**9), ("two views", roughness_finder.LEAST_SAVED)):
+        with changed("beam_warp.decomposition.roughness_finder:LEAST_SAVED", saved):
+            rows.append(roughness_row(name, [silent], light) | {"of": 1})
+    for every, some in (rows[:2], rows[2:]):
+        some["change"] = root_mean_square(some["found"].roughness - every["found"].roughness)
+    return [{key: value for key, value in row.items() if key != "found"} for row in rows]
+
+
+def seen_frame(capture: Capture, number: int, first: int, count: int, device: Any) -> SimpleNamespace:
+    """Return a frame as the main job sees it: Gaussians on the true surface, spread over that of the first frame."""
+    meshes = [read_truth_mesh(capture, frame) for frame in (number, first)]
+    vertices, rest = (np.asarray(mesh.vertices) for mesh in meshes)
+    views = [record.view() for record in capture.select(split="train", frames={number})]
+    bare = gaussians_on_mesh(vertices, np.asarray(meshes[0].faces), count, rest=rest)
+    cloud, cameras = colored_by_views(bare, views, options=SHARP, device=str(device)), [v.camera for v in views]
+    scene, evidence = (
+        Scene.from_gaussians(cloud, str(device)),
+        view_evidence(cloud, cameras, views, options=SHARP, device=str(device)),
+    )
+    points = SurfacePoints.seen_by(cloud, evidence, scene, "auto")
+    log = JobLog(lambda *_: None, 1, device)
+    return SimpleNamespace(number=number, cloud=cloud, scene=scene, points=points, views=evidence, log=log)
+
+
+def roughness_row(name: str, seen: list[SimpleNamespace], light: PreparedEnvironment) -> dict[str, Any]:
+    """Return an estimate, what it says of frames that were left out, and the seconds of the processor that it took."""
+    plan = SimpleNamespace(
+        light=SimpleNamespace(prepared=light),
+        source=SimpleNamespace(options=SimpleNamespace(gathering=MaterialOptions())),
+    )
+    order = roughness_finder.asked_frames(len(seen))
+    started = time.process_time()
+    found = roughness_finder.find_roughness(plan, (seen[place] for place in order), len(seen))  # type: ignore[arg-type]
+    told = {key: found.report[key] for key in ("frames", "left_out_change", "informed_part")}
+    stated = root_mean_square(found.standard_error)
+    return {"name": name, "found": found, "seconds": time.process_time() - started, "stated": stated} | told
+
+
+def views_of(capture: Capture, count: int, device: Any) -> list[dict[str, Any]]:
+    """Return base colour and occlusion by all training views of a frame, and by parts of them."""
+    frame = truth_frames(capture)[0]
+    whole = PerfectFrame.of(capture, frame, count, device)
+    assert capture.environment_path is not None
+    light = PreparedEnvironment(EnvironmentMap.read(capture.environment_path), device)
+    truth, rows, first = TruthViews(capture, frame, SHARP, 2, str(device)), [], None
+    for share in VIEW_SHARES:
+        kept = [view for place, view in enumerate(whole.views) if int((place + 1) * share) > int(place * share)]
+        started = time.process_time()
+        evidence = view_evidence(whole.cloud, [v.camera for v in kept], kept, options=SHARP, device=str(device))
+        evidence_seconds = time.process_time() - started
+        some = replace(whole, views=kept, evidence=evidence)
+        points, rough = some.points(exact=False), np.full(count, 0.5, np.float32)
+        how = {"options": MaterialOptions(), "views": evidence}
+        measured = measure_materials(whole.cloud, whole.scene, points, rough, light, **how)
+        seconds = time.process_time() - started
+        known = whole.cloud.with_arrays(normal_confidence=points.confidence)
+        color = solve_base_color(known, measured.evidence, light.mean_irradiance)
+        openness, _ = fill_from_neighbors(
+            whole.cloud.positions,
+            measured.ambient_occlusion[:, None],
+            measured.ambient_occlusion_error[:, None],
+            ~points.seen,
+        )
+        score = truth.score(whole.cloud, Materials(color.base_color, openness[:, 0].astype(np.float32)))
+        first = first or color
+        change = np.abs(color.base_color - first.base_color) / np.maximum(first.standard_error, 1e-6)
+        row = {
+            "name": f"{len(kept)} views",
+            "views": len(kept),
+            "seconds": seconds,
+            "evidence_seconds": evidence_seconds,
+        }
+        row |= {key: score[key]["psnr"] for key in ("base_color", "ambient_occlusion")}
+        rows.append(row | {"change_median": float(np.median(change)), "beyond_error": float((change > 1.0).mean())})
+    return rows
+
+
+PARTS = ("light", "occlusion", "bounce", "frames", "views")
 
 
 def main() -> None:
@@ -229,8 +337,18 @@ def main() -> None:
                 capture = write_demo_capture(Path(folder) / "demo", frame_count=1, samples=64, device=str(device))
             else:
                 capture = Capture.read(Path(given.data) / "captures" / name)
+            rows[name] = {}
+            if "frames" in given.parts:
+                rows[name]["frames"] = frames_of(capture, given.gaussians, device)
+            if "views" in given.parts:
+                rows[name]["views"] = views_of(capture, given.gaussians, device)
+            record.write_result(given, device, {"captures": rows})
+            for row in [*rows[name].get("frames", ()), *rows[name].get("views", ())]:
+                print(name, row, flush=True)
+            if not {"light", "occlusion", "bounce"} & {*given.parts}:
+                continue
             subject = Subject(capture, given.gaussians, given.reference_rays, device)
-            rows[name] = {"points": len(subject.rows)}
+            rows[name]["points"] = len(subject.rows)
             if "light" in given.parts:
                 rows[name]["light"] = light_of(subject, device, given.repeats)
             if "occlusion" in given.parts:

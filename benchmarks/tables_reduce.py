@@ -47,6 +47,25 @@ def certified(result: Row) -> Rows:
     return rows
 
 
+@table("keyed_takes", "keys_cpu.json")
+def keyed(result: Row) -> Rows:
+    """Return takes with a time sample at every frame and with keys: size, samples, errors, losses."""
+    arrays = {"positions": "positions", "orientations": "turns", "normals": "normals", "ambient_occlusion": "occlusion"}
+    head = ["take", "Gaussians", "error scale", "KB a frame", *arrays.values(), "of the bound"]
+    rows: list[list[Any]] = [[*head, "counted loss [dB]", "measured loss [dB]", "written [s a frame]"]]
+    for name in ("dance", "calm", "walk"):
+        found = result.get(name, {"rows": []})
+        for row in found["rows"]:
+            scale = "every frame" if row["factor"] is None else f"{row['factor']:g}"
+            samples = [str(row["samples"][array]) for array in arrays]
+            most = f"{max(row['of_bound'].values()):.2f}" if "of_bound" in row else ""
+            counted = f"{row['counted_mean']:.2f}, {row['counted_worst']:.2f}"
+            numbers = [cell(row["loss"], ".2f"), cell(row["write_seconds_a_frame"], ".2f")]
+            first = [name, f"{found['gaussians']:,}", scale, cell(row["kb_a_frame"], ".0f"), *samples, most]
+            rows.append([*first, counted, *numbers])
+    return rows
+
+
 @figure("reducing.webp", REDUCE)
 def draw_sizes(result: Row, path: Path) -> None:
     """Show the PSNR of every contender by asset: bare as outlines, refitted as bars."""

@@ -7,6 +7,9 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
+from beam_warp.converters.common.bounds import bounds_of
 from beam_warp.converters.common.colors import resize_bands
 from beam_warp.converters.common.frames import overruled
 from beam_warp.converters.common.importers import IMPORTERS
@@ -62,12 +65,13 @@ def write(
     sequence: GaussianSequence, path: Path, options: WriteOptions, clips: WrittenClips | None = None
 ) -> list[Path]:
     """Write an asset, y up and in metres, or complete one whose clips are written."""
-    whole = prepared(sequence, options.sh_degree)
+    made = prepared(sequence, options.sh_degree)
     return write_asset(
-        dataclasses.replace(whole, read_frame=_kept(whole.read_frame)),
+        dataclasses.replace(made, read_frame=_kept(made.read_frame)),
         path,
         full_float=options.full_float,
         lighting_variants=options.lighting_variants,
+        bounds=_key_bounds(made[0], options.error_scale) if options.keyed else None,
         clips=clips,
     )
 
@@ -84,6 +88,11 @@ def _kept(read: Callable[[int], GaussianCloud]) -> Callable[[int], GaussianCloud
         return kept[frame]
 
     return again
+
+
+def _key_bounds(cloud: GaussianCloud, factor: float) -> dict[str, float]:
+    """Return bounds on root mean squares: those of errors that are spread evenly within the bounds of a container."""
+    return {name: bound / np.sqrt(3.0) for name, bound in bounds_of(cloud, factor).items()}
 
 
 def prepared(sequence: GaussianSequence, sh_degree: int | None = None) -> GaussianSequence:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
-SCHEMA_VERSION = "1.2"
+SCHEMA_VERSION = "1.3"
 """Version of the schema that this package writes, major.minor; the policy is in CHANGES.md."""
 
 MATERIAL_API = "BeamRelightableGaussianAPI"

@@ -6,7 +6,7 @@ and each layer is complete for a host that does not know it.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from beam_warp._version import __version__
 from beam_warp.blocks import for_each_block
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION, SEQUENCE_API
+from beam_warp.schema.keys import key_times
 from beam_warp.schema.layout import (
     ASSET_PATH,
     CHANNELS,
@@ -33,6 +34,7 @@ from beam_warp.schema.layout import (
 from beam_warp.schema.shading import author_material
 from beam_warp.schema.survey import Survey, albedo_radiance, display_color, stored_arrays
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+from beam_warp.world.harmonics import SH_C0
 from beam_warp.world.metadata import stated_capture_frames, stated_raster
 from beam_warp.world.quaternions import matrix_of
 
@@ -55,12 +57,14 @@ class AssetContents:
         survey: Properties of the sequence.
         half: Names of the arrays to write in half precision.
         segment_length: Frames in one value clip; 0 if the asset has none.
+        bounds: How far each array may be from its original between keys; None for samples at every frame.
     """
 
     sequence: GaussianSequence
     survey: Survey
     half: frozenset[str]
     segment_length: int = 0
+    bounds: Mapping[str, float] | None = None
 
     def attributes(self, name: str) -> tuple[str, tuple[str, ...]]:
         """Return USD type and names of the attributes that hold an array, its primvar included, or the extent."""
@@ -176,6 +180,7 @@ def _author_asset_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
         ("frameCount", "int", len(sequence)),
         ("framesPerSecond", "double", float(sequence.frames_per_second)),
         ("topology", "token", sequence.topology),
+        ("sampling", "token", "everyFrame" if contents.bounds is None else "keyed"),
         ("segmentLength", "int", contents.segment_length),
         ("sourceAxes", "token", metadata.get("source_axes", contents.survey.axes)),
         ("sourceUnits", "token", metadata.get("source_units", "m")),
@@ -225,6 +230,10 @@ def _author_splats_prim(layer: Sdf.Layer, contents: AssetContents) -> None:
     color.colorSpace = LINEAR_REC709
     color.default = to_vt("color3f[]", display_color(first)[None])
     author_declarations(prim, contents, (*survey.names, "extent"))
+    if contents.bounds is not None:
+        for name in survey.names:
+            said = {"beam": {"keyedWithin": float(contents.bounds.get(name, 0.0))}}
+            prim.attributes[contents.attributes(name)[1][0]].SetInfo("customData", said)
     constant = [name for name in (*survey.names, "extent") if name not in contents.varying]
     for name, array in contents.stored(first, constant).items():
         type_name, usd_names = contents.attributes(name)
@@ -245,13 +254,44 @@ def author_declarations(prim: Sdf.PrimSpec, contents: AssetContents, names: tupl
                 spec.SetInfo("interpolation", "vertex")
 
 
-def author_frame(layer: Sdf.Layer, contents: AssetContents, frame: int, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Add one frame's time samples of the arrays that vary."""
-    for name in sorted(contents.varying):
-        type_name, usd_names = contents.attributes(name)
-        value = to_vt(type_name, arrays[name])
+def author_frames(
+    layer: Sdf.Layer, contents: AssetContents, frames: Iterable[tuple[int, Mapping[str, NDArray[Any]]]]
+) -> None:
+    """Add time samples of the arrays that vary, at all of some frames that follow each other, or at keys."""
+    values: dict[str, dict[float, Any]] = {name: {} for name in sorted(contents.varying)}
+    for frame, arrays in frames:
+        for name, held in values.items():
+            held[float(frame)] = to_vt(contents.attributes(name)[0], arrays[name])
+    boxes = values.pop("extent", {})
+    for name, held in values.items():
+        bound = None if contents.bounds is None else contents.bounds.get(name, 0.0)
+        times = _author_samples(layer, contents, name, held, bound)
+        boxes = _between_keys(boxes, times) if name == "positions" else boxes
+    _author_samples(layer, contents, "extent", boxes, None)
+
+
+def _author_samples(
+    layer: Sdf.Layer, contents: AssetContents, name: str, values: Mapping[float, Any], bound: float | None
+) -> list[float]:
+    """Add time samples of an array, all of its values or those that a bound asks for, and return their times."""
+    type_name, usd_names = contents.attributes(name)
+    times = [*values] if bound is None else key_times(name, type_name, values, bound)
+    for time in times:
         for usd_name in usd_names:
-            layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", float(frame), value)
+            layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", time, values[time])
+    return times
+
+
+def _between_keys(boxes: Mapping[float, Any], keys: Sequence[float]) -> dict[float, Any]:
+    """Return boxes of frames, made to hold what is blended between those at the keys of positions."""
+    grown = {}
+    for time, box in boxes.items():
+        before, after = max(key for key in keys if key <= time), min(key for key in keys if key >= time)
+        share = (time - before) / max(after - before, 1.0)
+        blended = (1.0 - share) * np.asarray(boxes[before]) + share * np.asarray(boxes[after])
+        (low, high), (least, most) = np.asarray(box), _rounded_outwards(*blended)
+        grown[time] = to_vt("float3[]", np.stack([np.minimum(low, least), np.maximum(high, most)]))
+    return grown
 
 
 def author_clips(prim: Sdf.PrimSpec, manifest: str, segments: list[tuple[int, str]], last_frame: int) -> None:
@@ -284,22 +324,22 @@ def albedo_layer(contents: AssetContents, path: Path) -> Sdf.Layer:
         _uniform(prim, name, type_name, value)
     author_declarations(prim, contents, ("radiance",))
     if "base_color" not in contents.varying:
-        usd_name, value = _albedo(contents, 0)
-        prim.attributes[usd_name].default = value
+        prim.attributes[contents.attributes("radiance")[1][0]].default = _albedo(contents, 0)
     return layer
 
 
-def author_albedo(layer: Sdf.Layer, contents: AssetContents, frame: int) -> None:
-    """Add one frame's time sample of a base colour that varies, as radiance."""
-    usd_name, value = _albedo(contents, frame)
-    layer.SetTimeSample(f"{SPLATS_PATH}.{usd_name}", float(frame), value)
+def author_albedo(layer: Sdf.Layer, contents: AssetContents, frames: Iterable[int]) -> None:
+    """Add time samples of a base colour that varies, as radiance, at all of some frames in a row, or at keys."""
+    bound = None if contents.bounds is None else contents.bounds.get("base_color", 0.0) / SH_C0
+    values = {float(frame): _albedo(contents, frame) for frame in frames}
+    _author_samples(layer, contents, "radiance", values, bound)
 
 
-def _albedo(contents: AssetContents, frame: int) -> tuple[str, Any]:
-    """Return a frame's base colour as radiance, in the precision of the asset's radiance, and its attribute's name."""
-    type_name, (usd_name,) = contents.attributes("radiance")
+def _albedo(contents: AssetContents, frame: int) -> Any:
+    """Return a frame's base colour as radiance, in the precision of the asset's radiance."""
     coefficients = albedo_radiance(contents.sequence[frame])
-    return usd_name, to_vt(type_name, coefficients.astype(np.float16 if "radiance" in contents.half else np.float32))
+    precision = np.float16 if "radiance" in contents.half else np.float32
+    return to_vt(contents.attributes("radiance")[0], coefficients.astype(precision))
 
 
 def author_variants(layer: Sdf.Layer, plain: str, albedo: str) -> None:
@@ -377,7 +417,9 @@ def kernel_extent(positions: NDArray[Any], orientations: NDArray[Any], scales: N
         bounds.append(np.stack([(positions[part] - reach).min(axis=0), (positions[part] + reach).max(axis=0)]))
 
     for_each_block(work, len(positions))
-    low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
-    return np.stack(
-        [np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)]
-    ).astype(np.float32)
+    return _rounded_outwards(np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1])
+
+
+def _rounded_outwards(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float32]:
+    ends = np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)
+    return np.stack(ends).astype(np.float32)

@@ -24,10 +24,11 @@ from beam_warp.schema.stage_queries import (
     applied_schemas,
     array_attribute,
     authored,
+    frame_times,
     has_material_api,
+    most_frames,
     open_asset,
     radiance_color_space,
-    sample_times,
     sequence_prim,
     splat_prims,
     stage_axes,
@@ -35,9 +36,6 @@ from beam_warp.schema.stage_queries import (
 )
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence, Topology
 from beam_warp.world.metadata import UNSTATED_RASTER, capture_frames_metadata, raster_metadata
-
-MAX_HELD_FRAMES = 16_384
-"""Most frames that an asset may count beyond its time samples: nine minutes of stillness at 30 frames per second."""
 
 RATE_RANGE = (1e-3, 1e6)
 """Range of playback rates [1/s]."""
@@ -66,7 +64,8 @@ def read_asset(path: str | Path, *, prim_path: str | None = None, trusted: bool 
 
     Any ``ParticleField3DGaussianSplat`` is read, wherever it is on the stage; without our schema it is not
     relightable. The transforms above the prim are applied (spherical harmonics included), units become metres, and
-    the up axis becomes the axes code: y up is ``rub``, z up is ``rfu``. Frames are the time samples of the prim.
+    the up axis becomes the axes code: y up is ``rub``, z up is ``rfu``. Frames are the time samples of the prim; of an
+    asset with keys, every time code of its range, interpolated by OpenUSD.
 
     Args:
         path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
@@ -280,13 +279,13 @@ def _metadata(prim: Usd.Prim, source: Path, notes: list[str]) -> dict[str, str]:
 
 def _timing(stage: Usd.Stage, prim: Usd.Prim, source: Path, notes: list[str]) -> tuple[list[float], float, Topology]:
     """Return the time of each frame, the playback rate, and the topology."""
-    times = sample_times(prim)
+    times = frame_times(prim)
     rate = stage.GetTimeCodesPerSecond()
     playing = sequence_prim(prim)
     topology = str(authored(playing, "beam:sequence:topology") or "perFrame") if playing is not None else "perFrame"
     count = authored(playing, "beam:sequence:frameCount", int) if playing is not None else None
     if count is not None and len(times) != count:
-        most = max(len(times), MAX_HELD_FRAMES)
+        most = most_frames(len(times))
         if not 1 <= count <= most:
             raise AssetFormatError(
                 f"{source}: beam:sequence:frameCount must be in [1, {most}] for {len(times)} time samples, "

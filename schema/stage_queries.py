@@ -14,6 +14,7 @@ from beam_warp.errors import AssetFormatError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.outputs import keep_original, keeps_originals
 from beam_warp.schema import MATERIAL_API, SEQUENCE_API, register
+from beam_warp.schema.clips import CLIP_FRAMES
 from beam_warp.schema.files import require_asset_file, require_opens
 from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE, UP_AXES, Channel
 
@@ -24,6 +25,9 @@ _COLOR_SPACES = {
     "lin_rec709_scene": LINEAR_REC709,
 }
 """Names that writers give to the two spaces in which splats are trained; OpenUSD has no name for the first."""
+
+MAX_HELD_FRAMES = 16_384
+"""Most frames that an asset may have beyond its time samples: nine minutes of stillness at 30 frames per second."""
 
 METERS_RANGE = (1e-9, 1e16)
 """Range of metersPerUnit: from `UsdGeom.LinearUnits.nanometers` to beyond `UsdGeom.LinearUnits.lightYears`."""
@@ -168,6 +172,24 @@ def sample_times(prim: Usd.Prim) -> list[float]:
         if attribute is not None:
             times.update(attribute.GetTimeSamples())
     return sorted(times | transform_times(prim))
+
+
+def is_keyed(prim: Usd.Prim) -> bool:
+    """Return True if the arrays of a prim have time samples at keys only, between which frames are interpolated."""
+    playing = sequence_prim(prim)
+    return playing is not None and authored(playing, "beam:sequence:sampling") == "keyed"
+
+
+def frame_times(prim: Usd.Prim) -> list[float]:
+    """Return the time of each frame: of a keyed prim, every whole step from its first sample to its last one."""
+    times = sample_times(prim)
+    span = times[-1] - times[0] if times and is_keyed(prim) else np.nan
+    return [times[0] + frame for frame in range(int(span) + 1)] if span < most_frames(len(times)) else times
+
+
+def most_frames(sample_count: int) -> int:
+    """Return the most frames that an asset may have with so many time samples."""
+    return max(CLIP_FRAMES * sample_count, MAX_HELD_FRAMES)
 
 
 def transform_times(prim: Usd.Prim) -> set[float]:

@@ -96,5 +96,5 @@ def _reload_layers(paths: list[Path]) -> None:
     """Reload replaced files in OpenUSD, which shares open layers within a process."""
     replaced = {str(path.resolve()) for path in paths}
     for layer in Sdf.Layer.GetLoadedLayers():
-        if not layer.anonymous and layer.realPath.partition("[")[0] in replaced:
+        if layer and not layer.anonymous and layer.realPath.partition("[")[0] in replaced:
             layer.Reload(True)

@@ -8,7 +8,7 @@ processes, for surveys of parts add up.
 from __future__ import annotations
 
 from collections.abc import Container, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beam_warp.digests import array_digest
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB, linear_to_srgb, srgb_to_linear
+from beam_warp.schema.keys import departure
 from beam_warp.schema.layout import CHANNELS, UP_AXES
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
@@ -134,19 +135,34 @@ class FramesSurvey:
         return {name for name, digest in self.digests.items() if not digest}
 
 
-def survey_sequence(sequence: GaussianSequence) -> Survey:
+def survey_sequence(sequence: GaussianSequence, bounds: Mapping[str, float] | None = None) -> Survey:
     """Read every frame once and return the properties of the sequence.
+
+    Args:
+        sequence: The sequence.
+        bounds: How far each array may be from its original: one that is never further from its first frame counts as
+            constant. None for arrays that must be the same.
 
     Raises:
         InvalidOptionError: A stage cannot state the axes, frames differ in axes or colour space, or the count changes
             although the topology is constant.
         InvalidArrayError: Frames differ in which arrays they hold.
     """
-    found = FramesSurvey.of(sequence[0])
+    first = sequence[0]
+    found, left = FramesSurvey.of(first), set[str]()
     require_upright(found.axes)
+    held = {} if bounds is None else stored_arrays(first)
     for frame in range(1, len(sequence)):
-        found += FramesSurvey.of(sequence[frame], found.varying | sequence.constant)
-    return Survey.of(found, sequence)
+        cloud = sequence[frame]
+        found += FramesSurvey.of(cloud, found.varying | sequence.constant)
+        arrays = stored_arrays(cloud) if bounds is not None else {}
+        left |= {
+            name
+            for name in found.varying & held.keys() - left
+            if departure(name, held[name], arrays[name]) > (bounds or {}).get(name, 0.0)
+        }
+    survey = Survey.of(found, sequence)
+    return survey if bounds is None else replace(survey, varying=survey.varying & left)
 
 
 def require_upright(axes: str) -> None:

@@ -27,7 +27,7 @@ from beam_warp.schema.authoring import (
     author_albedo,
     author_clips,
     author_declarations,
-    author_frame,
+    author_frames,
     author_stage,
     author_variants,
     define,
@@ -52,6 +52,7 @@ def write_asset(
     full_float: bool = False,
     lighting_variants: bool = False,
     segment_length: int = CLIP_FRAMES,
+    bounds: Mapping[str, float] | None = None,
     clips: WrittenClips | None = None,
 ) -> list[Path]:
     """Write a relightable 4D Gaussian asset.
@@ -73,6 +74,10 @@ def write_asset(
             selected, is the asset as it is without the set. In the variant ``albedo``, the radiance is the base colour,
             for renderers that light Gaussians and take their radiance for albedo. Not for ``.usdc``.
         segment_length: Frames in one value clip, and held in memory at once.
+        bounds: How far arrays may be from their originals, by name (`beam_warp.schema.keys.departure`); an array that
+            is not named must be the same. Arrays then have time samples at keys only, at most `segment_length` frames
+            apart, and those that never leave their bound have none. None writes a sample at every frame, as does a
+            topology other than ``constant``: rows that are not the same Gaussian must not be blended.
         clips: Clips of this sequence that `write_clip` has written; None to write all here.
 
     Returns:
@@ -91,10 +96,11 @@ def write_asset(
         )
     require_count("segment_length", segment_length)
     register()
-    survey = survey_sequence(sequence) if clips is None else clips.survey
+    bounds = bounds if sequence.topology == "constant" and len(sequence) > 1 else None
+    survey = survey_sequence(sequence, bounds) if clips is None else clips.survey
     half = frozenset() if full_float else survey.half
     clipped = len(sequence) > MAX_FRAMES_IN_ONE_LAYER and bool(survey.varying) and target.suffix != ".usdc"
-    contents = AssetContents(sequence, survey, half, segment_length if clipped else 0)
+    contents = AssetContents(sequence, survey, half, segment_length if clipped else 0, bounds)
     if target.suffix == ".usdz":
         _require_below_limit(target, contents.byte_count)
     with staged_folder(target) as folder:
@@ -115,11 +121,10 @@ def write_asset(
 def _write_single(contents: AssetContents, folder: Path, name: str, save_every: int) -> list[str]:
     """Write one binary layer with everything, saved repeatedly so that USD keeps frames on disk and not in memory."""
     layer = static_layer(contents, folder / name)
-    if contents.varying:
-        for frame, arrays in contents.frames():
-            author_frame(layer, contents, frame, arrays)
-            if (frame + 1) % save_every == 0:
-                _save(layer)
+    frames = contents.frames()
+    for _ in range(0, len(contents.sequence) if contents.varying else 0, save_every):
+        author_frames(layer, contents, islice(frames, save_every))
+        _save(layer)
     _save(layer)
     return [name]
 
@@ -167,8 +172,7 @@ def write_clip(
 
 def _write_clip(contents: AssetContents, frames: Iterable[tuple[int, Mapping[str, NDArray[Any]]]], path: Path) -> None:
     layer = _clip_layer(contents, path)
-    for frame, arrays in frames:
-        author_frame(layer, contents, frame, arrays)
+    author_frames(layer, contents, frames)
     _save(layer)
 
 
@@ -203,10 +207,10 @@ def _write_variants(contents: AssetContents, folder: Path, stem: str, plain: str
     """Write a binary layer of the albedo, and a text root layer that puts it over the plain asset in a variant."""
     names = [f"{stem}.albedo.usdc", f"{stem}.usda"]
     layer = albedo_layer(contents, folder / names[0])
-    for frame in range(len(contents.sequence) if "base_color" in contents.varying else 0):
-        author_albedo(layer, contents, frame)
-        if (frame + 1) % save_every == 0:
-            _save(layer)
+    frames = range(len(contents.sequence) if "base_color" in contents.varying else 0)
+    for start in frames[::save_every]:
+        author_albedo(layer, contents, frames[start : start + save_every])
+        _save(layer)
     _save(layer)
     root = Sdf.Layer.CreateNew(str(folder / names[1]))
     author_stage(root, contents)

@@ -122,7 +122,7 @@ class Matte:
         offset: How far the given mask reaches beyond the subject; None where the photograph does not tell.
         doubt: How much is not known of a pixel, 0 to 1, ``(H, W)`` float32: coverage and colour are a guess there.
         scene: The photograph; where the backdrop is not known, the subject alone, ``(H, W, 3)`` float32.
-        behind: The backdrop alone, 0 where it is not known, ``(H, W, 3)`` float32.
+        behind: The backdrop alone, 0 where it is not known or the mask stays as it is, ``(H, W, 3)`` float32.
     """
 
     color: NDArray[np.float32]
@@ -172,9 +172,10 @@ def matte(
     color[at] = _subject(seen[at], alpha[at], inner, outer, outline.nearest)
     scene, behind = color.copy(), np.zeros_like(color)
     contrast = np.square(inner.values - outer.values).sum(axis=1)
-    sure = 3.0 * outer.variances[outline.nearest] < BLURRED**2 * contrast
-    known = tuple(outline.near[sure].T)
-    scene[known], behind[known] = seen[known], np.maximum(outer.values[sure], 0.0)
+    if common != 0.0 or own.any():  # a mask that is right says more than colours do
+        sure = 3.0 * outer.variances[outline.nearest] < BLURRED**2 * contrast
+        known = tuple(outline.near[sure].T)
+        scene[known], behind[known] = seen[known], np.maximum(outer.values[sure], 0.0)
     return Matte(color, alpha, offset, np.abs(whole - parts), scene, behind)
 
 

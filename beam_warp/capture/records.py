@@ -239,7 +239,7 @@ class CaptureRecord:
             planes = dict(zip("RGB", np.moveaxis(rgb, -1, 0), strict=True))
             return self._undistorted(Image(image.path, planes, LINEAR_REC709, premultiplied=False)).linear_rgb()
 
-        backdrop = Backdrop(found.scene, found.behind).mapped(undistorted)
+        backdrop = Backdrop(found.scene, found.behind).mapped(undistorted) if found.behind.any() else None
         return cut, None if mask is None else found.offset, backdrop
 
     def _sized(self, image: Image, what: str) -> Image:

@@ -81,7 +81,8 @@ class ConvertCommand:
     lighting_variants: Annotated[
         bool, arg(help="USD: add a variant whose radiance is the base colour, for renderers that light it.")
     ] = False
-    error_scale: Annotated[float, arg(metavar="X", help="b4d: multiply the bounds of all errors.")] = 1.0
+    keyed: Annotated[bool, arg(help="USD: time samples only where frames between them are not within bounds.")] = False
+    error_scale: Annotated[float, arg(metavar="X", help="b4d, and USD with --keyed: multiply all bounds.")] = 1.0
     player: Annotated[bool, arg(help="Write a page, OUT.html, that plays the asset in any browser.")] = False
     environment: Annotated[
         tuple[Path, ...],

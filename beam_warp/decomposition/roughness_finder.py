@@ -1,49 +1,130 @@
-"""Roughness of the frames of a job: as it is stated, or estimated from what views of some frames show."""
+"""Roughness of the frames of a job: as it is stated, or estimated from what views of some frames show.
+
+Frames are asked as long as they change the answer by more than a part of its own stated error. Where a pilot, some
+Gaussians of the first frame, finds that views say nothing of roughness, none is asked.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from functools import reduce
-from operator import add
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.seen import SeenFrame
 from beam_warp.materials.roughness import (
+    LEAST_AGREEMENT,
     RoughnessEstimate,
     RoughnessProfile,
+    evenly_spread,
     measure_roughness_profile,
     solve_roughness,
 )
 
 ROUGHNESS_FRAMES = 8
-"""Frames of persistent Gaussians that roughness is found from, evenly spread: more add little that is new."""
+"""Most frames of persistent Gaussians that roughness is found from: more add little that is new."""
+
+PILOT_GAUSSIANS = 4096
+"""Gaussians by which it is told whether views say anything of roughness, and whether more frames would change it."""
+
+LEAST_SAVED = 8
+"""How many times as many Gaussians a frame must have for a pilot: it then costs an eighth of a frame at most."""
+
+PART = 0.1
+"""Part of its own stated error by which leaving out frames may change roughness: the mean square of its error then
+grows by a hundredth, and its PSNR falls by 0.04 dB."""
 
 
 def asked_frames(count: int) -> list[int]:
-    """Return the numbers of the frames that the roughness of persistent Gaussians is found from, of so many."""
-    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, ROUGHNESS_FRAMES))})
+    """Return the numbers of the frames that the roughness of persistent Gaussians is found from, of so many.
+
+    Each is as far from those before it as it can be, so that the first few are spread over the take as well.
+    """
+    left = sorted({round(place) for place in np.linspace(0, count - 1, min(count, ROUGHNESS_FRAMES))})
+    order = [left.pop(0)]
+    while left:
+        distances = [min(abs(number - other) for other in order) for number in left]
+        order.append(left.pop(int(np.argmax(distances))))
+    return order
 
 
-def find_roughness(plan: JobPlan, frames: Iterable[SeenFrame]) -> RoughnessEstimate:
-    """Estimate the roughness of Gaussians from what the views of some frames show, which all have them."""
-    positions: list[np.ndarray] = []
+def find_roughness(plan: JobPlan, frames: Iterable[SeenFrame], count: int) -> RoughnessEstimate:
+    """Estimate the roughness of Gaussians from what the views of some frames show, which all have them.
 
-    def measure(seen: SeenFrame) -> RoughnessProfile:
-        positions[:] = positions or [seen.cloud.positions]
-        scene, points, views = seen.scene, seen.points, seen.views
-        with seen.log.timer("roughness"):
-            return measure_roughness_profile(
-                seen.cloud,
-                scene,
-                points,
-                plan.light.prepared,
-                views,
-                options=plan.source.options.gathering,
-                frame=seen.number,
-                progress=seen.log.within("roughness", seen.number),
-            )
+    The report also has ``frames_left_out``, and by how much these would have changed roughness, root mean square,
+    as far as the frames before them tell (``left_out_change``).
 
-    profile = reduce(add, map(measure, frames))
-    return solve_roughness(positions[0], profile)
+    Args:
+        plan: The job.
+        frames: Read one at a time, as long as they are needed.
+        count: How many there are.
+    """
+    positions, asked = np.zeros((0, 3), np.float32), np.zeros(0, np.intp)
+    total: RoughnessProfile | None = None
+    told: RoughnessEstimate | None = None
+    used, change = 0, 0.0
+    for seen in frames:
+        if total is None:
+            positions = seen.cloud.positions
+            asked = evenly_spread(positions, PILOT_GAUSSIANS)
+            if _are_silent(plan, seen, asked, count):
+                break
+        profile = _measured(plan, seen)
+        total, used = profile if total is None else total + profile, used + 1
+        if used == count:
+            change = 0.0
+            break
+        found = solve_roughness(positions[asked], total.of(asked))
+        if told is not None:
+            change = _change_by_more(told, found, used, count)
+            if change <= PART * _size(found.standard_error):
+                break
+        told = found
+    estimate = solve_roughness(positions, total or RoughnessProfile.of_nothing(len(positions)))
+    left_out = {"frames_left_out": count - used, "left_out_change": change}
+    return replace(estimate, report={**estimate.report, **left_out})
+
+
+def _measured(plan: JobPlan, seen: SeenFrame, rows: NDArray[np.intp] | None = None) -> RoughnessProfile:
+    """Return what views of a frame say of all of its Gaussians, or of some."""
+    scene, points, views = seen.scene, seen.points, seen.views
+    with seen.log.timer("roughness"):
+        return measure_roughness_profile(
+            seen.cloud,
+            scene,
+            points,
+            plan.light.prepared,
+            views,
+            options=plan.source.options.gathering,
+            frame=seen.number,
+            rows=rows,
+            progress=seen.log.within("roughness", seen.number),
+        )
+
+
+def _are_silent(plan: JobPlan, seen: SeenFrame, asked: NDArray[np.intp], count: int) -> bool:
+    """Return whether views say so little of some Gaussians that all of them, in all frames, would claim nothing."""
+    gaussians = len(seen.cloud)
+    if gaussians < LEAST_SAVED * len(asked):
+        return False
+    report = solve_roughness(seen.cloud.positions[asked], _measured(plan, seen, asked)).report
+    agreement = max(report[scale]["agreement"] for scale in ("near", "wide"))
+    return agreement * count * gaussians / len(asked) <= LEAST_AGREEMENT
+
+
+def _change_by_more(before: RoughnessEstimate, after: RoughnessEstimate, used: int, count: int) -> float:
+    """Return by how much more frames would change an estimate, root mean square, as the last one has told.
+
+    A mean over k independent frames is off from that over n by as much as 1 / k - 1 / n, in the mean square.
+    """
+    last = _size(after.roughness - before.roughness)
+    return last * math.sqrt((1.0 / used - 1.0 / count) / (1.0 / (used - 1) - 1.0 / used))
+
+
+def _size(values: NDArray[Any]) -> float:
+    """Return the root mean square of values."""
+    return float(np.sqrt(np.mean(np.square(values), dtype=np.float64)))

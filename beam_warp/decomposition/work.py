@@ -328,7 +328,7 @@ class MaterialWork:
             write_frame(self.stored("roughness"), {})
             return {}
         asked = asked_frames(len(self.source.sequence))
-        estimate = find_roughness(self.job, self._frames(asked))
+        estimate = find_roughness(self.job, self._frames(asked), len(asked))
         write_frame(self.stored("roughness"), _roughness_arrays(estimate))
         return {"roughness": estimate.report}
 
@@ -397,7 +397,7 @@ class MaterialWork:
         shared = read_frame(self.stored("roughness")) if self._may_be_persistent else {}
         if shared:
             return shared
-        estimate = find_roughness(self.job, [frame])
+        estimate = find_roughness(self.job, [frame], 1)
         facts["roughness"] = estimate.report
         return _roughness_arrays(estimate)
 

@@ -130,6 +130,16 @@ class RoughnessProfile:
             np.add(self.tilt, other.tilt, dtype=np.float64),
         )
 
+    @classmethod
+    def of_nothing(cls, count: int) -> RoughnessProfile:
+        """Return the profile of Gaussians of which no frame was asked."""
+        return cls(np.zeros((int(PARTS), count, len(CANDIDATES)), np.float32), np.zeros(count, np.float32), frames=0)
+
+    def of(self, rows: NDArray[np.integer[Any]]) -> RoughnessProfile:
+        """Return the profile of some of the Gaussians."""
+        tilt = np.broadcast_to(self.tilt, len(self.views))
+        return RoughnessProfile(self.misfit[:, rows], self.views[rows], self.frames, tilt[rows])
+
 
 @dataclass(frozen=True)
 class RoughnessPrior:
@@ -184,6 +194,7 @@ def measure_roughness_profile(
     *,
     options: MaterialOptions,
     frame: int = 0,
+    rows: NDArray[np.integer[Any]] | None = None,
     progress: CountProgress | None = None,
 ) -> RoughnessProfile:
     """Trace the light of one frame and try every candidate on what its views show.
@@ -196,17 +207,20 @@ def measure_roughness_profile(
         views: What views with images show; None takes the captured radiance around each normal.
         options: Rays, offset, bounce, seed; as for `beam_warp.materials.direct.measure_materials`.
         frame: Number of the frame, for the rays' random streams.
+        rows: Gaussians to measure; all of them if None.
         progress: Called now and then with (Gaussians done, Gaussians in all).
 
     Raises:
         InvalidArrayError: The cloud has no captured radiance.
     """
     device = scene.device
-    count = len(cloud)
+    chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
+    count = len(chosen)
     points = points.on_faces()
-    shown = np.flatnonzero(points.seen)
+    told = np.flatnonzero(points.seen[chosen])
+    shown = chosen[told]
     # Any roughness will do here: the candidates take its place.
-    measured = lit_points(cloud, points, np.ones(count, np.float32), light, shown, views)
+    measured = lit_points(cloud, points, np.ones(len(cloud), np.float32), light, shown, views)
     candidates = upload(np.array(CANDIDATES, np.float32), float, device)
     fit = ProfileFit()
     fit.misfit = wp.zeros((int(PARTS), len(shown), len(CANDIDATES)), dtype=float, device=device)
@@ -225,9 +239,9 @@ def measure_roughness_profile(
         launch_profile(items, batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
     misfit = np.zeros((int(PARTS), count, len(CANDIDATES)), np.float32)
     counted = np.zeros(count, np.float32)
-    misfit[:, shown], counted[shown] = fit.misfit.numpy(), fit.views.numpy()
+    misfit[:, told], counted[told] = fit.misfit.numpy(), fit.views.numpy()
     # The normal is a mean over views, whose errors have little in common.
-    return RoughnessProfile(misfit, counted, tilt=np.minimum(counted, 1.0) * points.normal_error**2)
+    return RoughnessProfile(misfit, counted, tilt=np.minimum(counted, 1.0) * points.normal_error[chosen] ** 2)
 
 
 def solve_roughness(
@@ -286,6 +300,12 @@ def solve_roughness(
     informed = (weight * spread[index]).sum(axis=1) < INFORMED_PART * moments[1]
     report = {"near": near_evidence, "wide": wide_evidence, "step": step, "frames": profile.frames}
     return _estimate(roughness, error, informed, chosen, moments, report)
+
+
+def evenly_spread(positions: NDArray[np.floating[Any]], count: int) -> NDArray[np.intp]:
+    """Return about so many rows of positions, spread evenly along a curve through them, or all; ascending."""
+    order = _along_curve(np.asarray(positions, np.float64))
+    return np.sort(order[:: max(len(order) // count, 1)])
 
 
 def narrowed(roughness: NDArray[np.floating[Any]], tilt: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:

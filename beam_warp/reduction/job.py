@@ -27,6 +27,7 @@ from beam_warp.reduction.merging import MergeOrder
 from beam_warp.reduction.pilot import fast_enough, images_a_second, steps_within
 from beam_warp.reduction.refit import refit
 from beam_warp.reduction.sensitivity import Sensitivity, measure_sensitivity
+from beam_warp.schema.clips import CLIP_FRAMES
 from beam_warp.world.clusters import Clusters
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
@@ -53,13 +54,14 @@ FEWEST = 16
 """Gaussians below which no search goes."""
 
 SCALES, SIZED_SCALES = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25), (4.0, 1.0)
-"""Factors of the bounds of delivery, coarsest first: those that are tried within a bound, and within a size."""
+"""Factors of the bounds of delivery and of keys, coarsest first: those tried within a bound, and within a size."""
 
 FINEST = 0.03
 """Factor of the bounds of delivery of a last try: what does not keep a bound with it cannot be delivered within it."""
 
 FOR_GAUSSIANS = 0.85
-"""Share of a bound that having fewer Gaussians may use up where delivery takes the rest."""
+"""Share of a bound that having fewer Gaussians may use up where delivery or keys take the rest. Keys are used where
+they save as large a share of the bytes as they take of the bound."""
 
 HEADROOM = 1.1
 """Bound that is certified where none was asked for, over the worst error of the search."""
@@ -189,7 +191,7 @@ class Reduction:
         paths: The files written.
         original_count: Gaussians of the original.
         candidates: Numbers of Gaussians that were tried, and their errors on the search's half.
-        error_scale: Factor of the bounds of delivery; None for other containers.
+        error_scale: Factor of the bounds of delivery, or of an asset's keys; None where every frame is exact.
         steps: Steps of its refit.
         fps: Images a second that were drawn of what is written; None unless they were asked for.
     """
@@ -384,6 +386,18 @@ class _Search:
         self._draws = reducer.trials.draw("search", range(start, start + TRIED), range(len(reducer.original)))
         self.timed = self._draws[:DRAWN]
         self._delivers = format_of(place).name == "b4d"
+        self._scaled = self._delivers or self._keys_pay(reducer.original)
+
+    def _keys_pay(self, original: GaussianSequence) -> bool:
+        """Return whether keys save more than they cost, by the first clip of the original."""
+        if len(original) < 2:
+            return False
+        some = replace(original, frame_count=min(len(original), CLIP_FRAMES), metadata={})
+        sizes = []
+        for scale in (None, 1.0):
+            paths = converters.write(some, self._place.with_stem(f"pilot_{scale}"), _written_as(scale))
+            sizes.append(sum(path.stat().st_size for path in paths))
+        return sizes[1] < FOR_GAUSSIANS * sizes[0]
 
     def candidate(self, count: int, steps: int | None = None) -> GaussianSequence:
         """Return the reduced asset of a number of Gaussians, made once."""
@@ -406,21 +420,21 @@ class _Search:
     def more(self, count: int, scale: float | None, *, last: bool) -> tuple[int, float | None]:
         """Return what to try after a candidate that failed: the most there is if it is the last try."""
         if last:
-            return len(self._reducer), None if scale is None else FINEST
+            return len(self._reducer), FINEST if self._delivers else None
         return min(len(self._reducer), int(np.ceil(MORE * count))), None if scale is None else 0.5 * scale
 
     def target(self) -> tuple[int, float | None]:
-        """Return how many Gaussians meet the target, and how exactly they are delivered, None for USD."""
+        """Return how many Gaussians meet the target, and how exactly they are stored, None for every frame as it is."""
         options = self._options
         if options.gaussians is not None:
-            return min(options.gaussians, len(self._reducer)), 1.0 if self._delivers else None
+            return min(options.gaussians, len(self._reducer)), 1.0 if self._scaled else None
         if options.size is not None:
             return self._within_size(options.size)
         if options.target_fps is not None:
             how = (self._comparison, self.timed, self.candidate, len(self._reducer))
-            return fast_enough(options.target_fps, *how), 1.0 if self._delivers else None
+            return fast_enough(options.target_fps, *how), 1.0 if self._scaled else None
         assert options.bound is not None
-        if not self._delivers:
+        if not self._scaled:
             return self._fewest(options.bound), None
         count = self._fewest(FOR_GAUSSIANS * options.bound)
         within = (scale for scale in SCALES if self.error(self.stored(count, scale)[0]) <= options.bound)
@@ -444,13 +458,13 @@ class _Search:
     def _within_size(self, size: int) -> tuple[int, float | None]:
         """Return the number of Gaussians and the exactness of delivery that err least in so many bytes."""
         found: list[tuple[float, int, float | None]] = []
-        for scale in SIZED_SCALES if self._delivers else (None,):
+        for scale in SIZED_SCALES if self._scaled else (None,):
             count = self._fitting(size, scale)
             if count:
                 found.append((self.error(self.stored(count, scale)[0]), count, scale))
                 self.tried.append((count, found[-1][0]))
         if not found:
-            least = self.stored(min(FEWEST, len(self._reducer)), SIZED_SCALES[0] if self._delivers else None, 0)[1]
+            least = self.stored(min(FEWEST, len(self._reducer)), SIZED_SCALES[0] if self._scaled else None, 0)[1]
             raise InvalidOptionError(f"size must be at least {least} bytes for this asset, got {size}. Allow more.")
         return min(found, key=lambda each: each[0])[1:]
 
@@ -474,7 +488,7 @@ class _Search:
 
 
 def _written_as(scale: float | None) -> converters.WriteOptions:
-    return converters.WriteOptions() if scale is None else converters.WriteOptions(error_scale=scale)
+    return converters.WriteOptions() if scale is None else converters.WriteOptions(keyed=True, error_scale=scale)
 
 
 def _require_reducible(original: GaussianSequence, clouds: Sequence[GaussianCloud], frames: Sequence[int]) -> None:

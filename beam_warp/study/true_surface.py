@@ -57,7 +57,9 @@ _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])
 """Powers of the inverse of the plastic number, whose multiples fill the square evenly (Roberts 2018)."""
 
 
-def gaussians_on_mesh(vertices: ArrayLike, faces: ArrayLike, count: int) -> GaussianCloud:
+def gaussians_on_mesh(
+    vertices: ArrayLike, faces: ArrayLike, count: int, *, rest: ArrayLike | None = None
+) -> GaussianCloud:
     """Tile a mesh with flat Gaussians, spread evenly over its area, each along the mesh's normal there.
 
     Faces are gone through along a Morton curve and points set at equal steps of their area, so that neither holes nor
@@ -67,6 +69,8 @@ def gaussians_on_mesh(vertices: ArrayLike, faces: ArrayLike, count: int) -> Gaus
         vertices: ``(V, 3)`` [m].
         faces: ``(F, 3)``, counter-clockwise seen from outside.
         count: Number of Gaussians.
+        rest: Vertices of another pose, over whose area Gaussians are spread: row i is then the same place of the
+            surface in every pose. None spreads them over the mesh itself.
 
     Returns:
         Gaussians with normals, in the axes of the mesh, which are taken for the internal world's.
@@ -75,7 +79,8 @@ def gaussians_on_mesh(vertices: ArrayLike, faces: ArrayLike, count: int) -> Gaus
         InvalidArrayError: The mesh has no area.
     """
     require_count("count", count, 1, 1 << 24)
-    points = require_array("vertices", vertices, (None, 3)).astype(np.float64)
+    posed = require_array("vertices", vertices, (None, 3)).astype(np.float64)
+    points = posed if rest is None else require_array("rest", rest, posed.shape).astype(np.float64)
     corners = np.asarray(faces, np.int64)
     crossed = np.cross(points[corners[:, 1]] - points[corners[:, 0]], points[corners[:, 2]] - points[corners[:, 0]])
     areas = 0.5 * np.linalg.norm(crossed, axis=1)
@@ -88,11 +93,11 @@ def gaussians_on_mesh(vertices: ArrayLike, faces: ArrayLike, count: int) -> Gaus
     square = (np.arange(1, count + 1)[:, None] * _PLASTIC) % 1.0
     square = np.where(square.sum(axis=1, keepdims=True) > 1.0, 1.0 - square, square)
     weights = np.column_stack([1.0 - square.sum(axis=1), square])
-    normals = np.einsum("nk,nkc->nc", weights, vertex_normals(points, corners)[corners[chosen]])
+    normals = np.einsum("nk,nkc->nc", weights, vertex_normals(posed, corners)[corners[chosen]])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     flat = crossed[chosen] / np.maximum(2.0 * areas[chosen, None], 1e-300)
     normals = np.where(lengths > 1e-6, normals / np.maximum(lengths, 1e-6), flat)
-    places = np.einsum("nk,nkc->nc", weights, points[corners[chosen]])
+    places = np.einsum("nk,nkc->nc", weights, posed[corners[chosen]])
     tiles = tile((TiledSurface(places, normals, float(np.sqrt(reached[-1] / count))),))
     scales = tiles.scales.copy()
     scales[:, 2] = FLATNESS * scales[:, 0]

@@ -61,7 +61,9 @@ class WriteOptions:
         sh_degree: Degree of the written spherical harmonics, padded with zeros or cut; None keeps it.
         spz_version: SPZ only. 3 is read by nearly everything; 4 is smaller and also holds degree 4.
         full_float: USD only. Single precision throughout instead of half where half suffices.
-        error_scale: b4d only. Factor of all bounds on the errors of delivery, in [0.01, 100].
+        keyed: USD only. Time samples only where interpolation between others does not stay within the bounds of
+            `beam_warp.converters.common.bounds`.
+        error_scale: b4d, and USD with keys. Factor of all bounds on errors, in [0.01, 100].
         lighting_variants: USD only. Adds a variant whose radiance is the base colour, for renderers that light it.
 
     Raises:
@@ -75,6 +77,7 @@ class WriteOptions:
     spz_version: int = 3
     full_float: bool = False
     lighting_variants: bool = False
+    keyed: bool = False
     error_scale: float = 1.0
 
     def __post_init__(self) -> None:

@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from beam_warp._version import __version__
 from beam_warp.converters.common.activations import log_scale
+from beam_warp.converters.common.bounds import bounds_of
 from beam_warp.converters.common.colors import resize_bands
 from beam_warp.converters.common.options import WriteOptions
 from beam_warp.converters.delivery.decoder import FREE_BYTES, MANIFEST, MAX_RATIO, product, quaternions, rotated
@@ -48,35 +49,6 @@ _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every entry, so that the same Gaussians give the same bytes."""
 
 Arrays = dict[str, NDArray[np.float32]]
-
-
-def bounds_of(cloud: GaussianCloud, factor: float = 1.0) -> dict[str, float]:
-    """Return how far an array may be from its original: no coordinate of any Gaussian in any frame is further.
-
-    Positions, normals and occlusion, which take most of the space, change relit images about equally by their bounds.
-    Positions have the finest: where they move by the thickness of Gaussians, others come to lie in front.
-
-    Positions are in metres: a part of the width of the median Gaussian. Scales are relative, rotations and normals are
-    angles [rad], and all others are differences.
-
-    Args:
-        cloud: A frame of the take.
-        factor: Multiplies all bounds.
-    """
-    width = float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) if len(cloud) else 0.0
-    bounds = {
-        "positions": 0.05 * max(width, 1e-6),
-        "orientations": 0.02,
-        "turns": 0.02,
-        "scales": 0.02,
-        "opacities": 0.01,
-        "base_color": 0.005,
-        "roughness": 0.02,
-        "ambient_occlusion": 0.03,
-        "normals": 0.06,
-        "radiance": 0.01,
-    }
-    return {name: factor * bound for name, bound in bounds.items()}
 
 
 def _allowed(name: str, bound: float) -> float:
@@ -243,6 +215,7 @@ class Take:
         first = change_axes(sequence[0], AXES)
         order = _order(first.positions)
         bounds, raw = bounds_of(first, options.error_scale), _raw(first.select(order), options)
+        bounds["turns"] = bounds["orientations"]
         return cls(sequence, order, bounds, raw, options, first.radiance_color_space)
 
     def __post_init__(self) -> None:

@@ -27,7 +27,9 @@ from beam_warp.schema.stage_queries import (
     array_attribute,
     authored,
     clip_sets,
+    frame_times,
     has_whole_clips,
+    is_keyed,
     radiance_color_space,
     sample_times,
     sequence_prim,
@@ -280,9 +282,9 @@ def _state_frame_count(playing: Usd.Prim, name: str) -> None:
 
 @mending("BEAM-SEQ-005")
 def _state_topology(prim: Usd.Prim, _: str) -> None:
-    """Rows are stated to be unrelated, since their number changes."""
+    """Rows are stated to be unrelated, since their number changes; not of an asset that has keys."""
     playing = sequence_prim(prim)
-    if playing is not None:
+    if playing is not None and not is_keyed(prim):
         _state(playing, "beam:sequence:topology", "token", "perFrame")
 
 
@@ -328,7 +330,8 @@ class _Place(NamedTuple):
 def _rewrite(prim: Usd.Prim, name: str, columns: int, change: Change) -> None:
     """Change an array wherever it is stored, in order of time; all of it or, if one part cannot be mended, nothing."""
     attribute = prim.GetAttribute(name)
-    places = _places(attribute, _times(prim))
+    keys = attribute.GetTimeSamples() if is_keyed(prim) else []
+    places = _places(attribute, keys or _times(prim))
     changed: dict[_Place, NDArray[Any]] = {}
     for place, times in places.items():
         value = np.asarray(attribute.Get(times[0]))
@@ -413,7 +416,7 @@ def _whole_prims(stage: Usd.Stage) -> list[Usd.Prim]:
 
 
 def _times(prim: Usd.Prim) -> list[float]:
-    return sample_times(prim) or [prim.GetStage().GetStartTimeCode()]
+    return frame_times(prim) or [prim.GetStage().GetStartTimeCode()]
 
 
 def _columns(name: str) -> int:

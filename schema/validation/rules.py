@@ -25,6 +25,7 @@ from beam_warp.schema.stage_queries import (
     clip_sets,
     has_material_api,
     has_whole_clips,
+    is_keyed,
     sample_times,
     sequence_prim,
     splat_prims,
@@ -89,6 +90,7 @@ SEQUENCE_FACTS = ("beam:sequence:frameCount", "beam:sequence:framesPerSecond", "
 OPTIONAL_TOKENS = {
     "beam:roughnessSource": ("texture", "estimated", "constant", "unknown"),
     "beam:sequence:topology": ("constant", "perSegment", "perFrame"),
+    "beam:sequence:sampling": ("everyFrame", "keyed"),
 }
 
 
@@ -329,8 +331,8 @@ def _frame_count(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-SEQ-003", "error")
 def _same_samples(prim: Usd.Prim) -> Iterator[Fault]:
-    """All arrays that vary have the same time samples, so that each frame is complete."""
-    samples = _own_samples(prim)
+    """Unless they are keyed, all arrays that vary have the same time samples, so that each frame is complete."""
+    samples = {} if is_keyed(prim) else _own_samples(prim)
     union = sorted(set().union(*samples.values())) if samples else []
     for name, times in samples.items():
         if times != union:
@@ -340,10 +342,10 @@ def _same_samples(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-SEQ-004", "error")
 def _contiguous_samples(prim: Usd.Prim) -> Iterator[Fault]:
-    """There are time samples at every whole time code from startTimeCode to endTimeCode, and at no other time."""
+    """Unless arrays are keyed, there are time samples at every whole time code of the range, and at no other time."""
     stage = prim.GetStage()
     union = sorted(set().union(*_own_samples(prim).values()))
-    if not has_material_api(prim) or not union or not stage.HasAuthoredTimeCodeRange():
+    if not has_material_api(prim) or not union or not stage.HasAuthoredTimeCodeRange() or is_keyed(prim):
         return
     wanted = list(np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1.0))
     if union != wanted:
@@ -363,6 +365,23 @@ def _capture_frames(prim: Usd.Prim) -> Iterator[Fault]:
         yield Fault(f"captureFrames must hold a number for each of {count} frames, got {len(numbers)}. Mend it.")
     elif any(number < 0 for number in numbers):
         yield Fault(f"captureFrames must not be negative, got {min(numbers)}. Number the frames from 0.")
+
+
+@entering(PRIM_RULES, "BEAM-SEQ-010", "error")
+def _keys(prim: Usd.Prim) -> Iterator[Fault]:
+    """Keyed arrays have a constant topology, and samples at whole time codes of the range, its ends among them."""
+    stage = prim.GetStage()
+    if not is_keyed(prim) or not stage.HasAuthoredTimeCodeRange():
+        return
+    if authored(sequence_prim(prim), "beam:sequence:topology") != "constant":
+        yield Fault("topology must be constant with keys, got another one. Write a sample at every frame.")
+    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    for attribute in filter(None, (array_attribute(prim, channel) for channel in CHANNELS.values())):
+        times = attribute.GetTimeSamples()
+        whole = all((time - first).is_integer() for time in times)
+        if times and not (whole and (times[0], times[-1]) == (first, last)):
+            message = f"samples must be whole time codes from {first:g} to {last:g}, got {times[0]:g} to {times[-1]:g}"
+            yield Fault(f"{message}. Write both ends.", attribute.GetName())
 
 
 @entering(FIRST_RULES, "BEAM-CLIP-001", "error")
@@ -387,13 +406,16 @@ def _clip_manifest(prim: Usd.Prim) -> Iterator[Fault]:
 
 @entering(PRIM_RULES, "BEAM-CLIP-003", "error")
 def _clips_cover(prim: Usd.Prim) -> Iterator[Fault]:
-    """The active clip has a sample of every declared attribute at every time code of the range."""
+    """The active clip has a sample of every declared attribute at every time code, or, with keys, at its ends."""
     stage = prim.GetStage()
     for clips in clip_sets(prim):
         if not clips.active or not stage.HasAuthoredTimeCodeRange():
             continue
+        first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        starts = sorted(start for start, _ in clips.active)[1:]
+        ends = (first, *(time for start in starts for time in (start - 1.0, start)), last)
         for name in sorted(clips.declared() & clips.sampled(0)):
-            for time in np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1.0):
+            for time in ends if is_keyed(prim) and name != "extent" else np.arange(first, last + 1.0):
                 if not clips.has_sample(name, float(time)):
                     yield Fault(f"the active clip must have a sample at time {time:g}, got none. Write it.", name)
                     break

@@ -20,7 +20,7 @@ from beam_warp.schema import register
 from beam_warp.schema.files import require_asset_file, run_child, size_around
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, from_vt
 from beam_warp.schema.probe import limit_memory, said_by_usd, special_file
-from beam_warp.schema.stage_queries import array_attribute, authored, sample_times, sequence_prim, splat_prims
+from beam_warp.schema.stage_queries import array_attribute, authored, frame_times, is_keyed, sequence_prim, splat_prims
 from beam_warp.schema.validation.frame_rules import FRAME_RULES, FrameArrays
 from beam_warp.schema.validation.report import BrokenRule, Report, Severity
 from beam_warp.schema.validation.rules import FIRST_RULES, PRIM_RULES, STAGE_RULES, Rule
@@ -121,21 +121,25 @@ def ask(rule: Rule, subject: object, path: str) -> Iterator[BrokenRule]:
 
 
 def _frames(prim: Usd.Prim, names: Set[str], interval: Gf.Interval | None) -> Iterator[tuple[float, FrameArrays]]:
-    """Read arrays of a prim frame by frame; those that do not vary are read once."""
+    """Read arrays of a prim frame by frame; those that do not vary are read once.
+
+    With keys, an array is read at its own samples; between them, it is held, except for positions.
+    """
     attributes = {name: array_attribute(prim, channel) for name, channel in CHANNELS.items() if name in names}
     attributes = {name: attribute for name, attribute in attributes.items() if attribute is not None}
     varying = frozenset(name for name, attribute in attributes.items() if attribute.ValueMightBeTimeVarying())
+    keys = {name: set(attributes[name].GetTimeSamples()) for name in (varying if is_keyed(prim) else ())}
     playing = sequence_prim(prim)
     topology = authored(playing, "beam:sequence:topology") if playing is not None else None
     degree = authored(prim, SH_DEGREE)
     arrays: dict[str, np.ndarray] = {}
     previous = None
-    for time in sample_times(prim) or [prim.GetStage().GetStartTimeCode()]:
+    for time in frame_times(prim) or [prim.GetStage().GetStartTimeCode()]:
         if interval is not None and not interval.Contains(time):
             continue
-        changed = frozenset(attributes) if previous is None else varying
+        changed = frozenset(attributes if previous is None else (n for n in varying if time in keys.get(n, (time,))))
         arrays = dict(arrays)
-        for name in changed:
+        for name in changed | (varying & {"positions"}):
             arrays.pop(name, None)
             value = _value(attributes[name], time)
             if value is not None:

@@ -166,7 +166,7 @@ def test_a_closed_folder(person, capsys):
 def test_inspect(person, capsys):
     code, out, _ = run("inspect", person / "person.ply", capsys=capsys)
     assert code == 0
-    assert "producer    beam-warp (beam_schema 1.2)\n" in out
+    assert "producer    beam-warp (beam_schema 1.3)\n" in out
     assert "materials   base_color\n" in out
     code, out, _ = run("inspect", person / "take", "--json", capsys=capsys)
     assert json.loads(out)["frame_count"] == 3

@@ -97,7 +97,7 @@ def test_the_file_obeys_the_rules_of_importers(make_cloud, tmp_path):
         assert len(body) == 50 * 4 * len(properties)
         assert np.isfinite(np.frombuffer(body, "<f4")).all()
         assert "comment beam_axes rfu" in lines
-        assert "comment beam_schema 1.2" in lines
+        assert "comment beam_schema 1.3" in lines
         assert "comment beam_frame 0 30" in lines
         assert ("comment beam_material linear" in lines) == (name == "beam")
         assert ("comment beam_base_color_space lin_rec709_scene" in lines) == (name == "beam")
@@ -122,7 +122,7 @@ def test_the_beam_profile_keeps_every_channel(make_cloud, tmp_path):
         assert np.array_equal(getattr(back, name), getattr(cloud, name)), name
     assert back.is_relightable
     assert back.radiance_color_space == LINEAR_REC709
-    assert sequence.metadata["producer"] == "beam-warp (beam_schema 1.2)"
+    assert sequence.metadata["producer"] == "beam-warp (beam_schema 1.3)"
 
 
 finite = st.floats(-(2.0**100), 2.0**100, width=32)

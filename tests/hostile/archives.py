@@ -21,7 +21,7 @@ from PIL import Image as PillowImage
 from support.radiant_cloud import radiant_cloud
 
 from beam_warp import converters
-from beam_warp.converters.delivery import writer
+from beam_warp.converters.common.bounds import bounds_of
 from beam_warp.schema.reader import read_asset
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -301,7 +301,7 @@ def delivery_folder(folder: Path) -> Path:
 
 
 DELIVERY_FREE = frozenset(
-    {"generator", "topology", "bounds", "metadata", "offset", "in UTF-16", *writer.bounds_of(radiant_cloud(3))}
+    {"generator", "topology", "bounds", "metadata", "offset", "in UTF-16", "turns", *bounds_of(radiant_cloud(3))}
 )
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pxr import Usd
 from scipy.spatial.transform import Rotation
 from support.shapes import sphere_points
 
@@ -35,13 +36,13 @@ LIGHTS = [demo_environments()["studio"].resized(16, 32), demo_environments()["st
 QUICK = ReduceOptions(gaussians=60, height=32, views=4, steps=6, pairs=6, device="cpu")
 
 
-def ball(count: int = 300, frames: int = 1) -> GaussianSequence:
-    """A ball of Gaussians in two colours, which turns."""
+def ball(count: int = 300, frames: int = 1, angle: float = 0.3) -> GaussianSequence:
+    """A ball of Gaussians in two colours, which turns by an angle each frame."""
     still, spacing = sphere_points(count)
     facing = Rotation.from_quat(turns_from_z(still))
     clouds = []
     for frame in range(frames):
-        turn = Rotation.from_rotvec([0.0, 0.0, 0.3 * frame])
+        turn = Rotation.from_rotvec([0.0, 0.0, angle * frame])
         normals = turn.apply(still)
         clouds.append(
             GaussianCloud(
@@ -133,6 +134,31 @@ def test_a_moving_asset_is_certified_as_it_is_stored(name, tmp_path, few_draws):
         assert measured_again(back, None, LIGHTS, device="cpu").passed is None
         with pytest.raises(InvalidOptionError, match="original must be the certificate's"):
             measured_again(back, back, LIGHTS, device="cpu")
+
+
+@pytest.mark.parametrize(("angle", "scale", "least"), [(0.01, 1.0, 2), (2.0, None, 8)])
+def test_time_samples_are_keys_where_that_saves_space(tmp_path, few_draws, angle, scale, least):
+    found = reduce_asset(ball(80, frames=8, angle=angle), LIGHTS, replace(QUICK, gaussians=40), tmp_path / "small.usda")
+    assert found.error_scale == scale
+    back = converters.read(tmp_path / "small.usda")
+    assert (len(back), back.topology) == (8, "constant")
+    assert found.certificate.asset == asset_digest(back)
+    stage = Usd.Stage.Open(str(tmp_path / "small.usda"))
+    samples = stage.GetPrimAtPath("/Asset/Splats").GetAttribute("positions").GetNumTimeSamples()
+    assert least <= samples <= (8 if scale is None else 4)
+
+
+@pytest.mark.slow
+def test_a_bound_on_error_chooses_how_far_keys_are_apart(tmp_path, few_draws, monkeypatch):
+    monkeypatch.setattr(job, "ROUNDS", 2)
+    original, scales = ball(120, frames=8, angle=0.05), []
+    for bound in (0.05, 0.4):
+        options = replace(QUICK, gaussians=None, target_error=bound, confidence=0.5, pairs=70, steps=1)
+        found = reduce_asset(original, LIGHTS, options, tmp_path / f"{bound}.usda")
+        assert found.certificate.share >= job.SHARE
+        scales.append(found.error_scale)
+    assert scales[1] == job.SCALES[0]
+    assert scales[0] is None or scales[0] <= scales[1]
 
 
 @pytest.mark.slow

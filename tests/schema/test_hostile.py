@@ -11,7 +11,8 @@ from pxr import Usd
 
 from beam_warp.errors import AssetFormatError, MissingFileError, SchemaVersionError
 from beam_warp.schema.files import require_asset_file, size_around
-from beam_warp.schema.reader import MAX_HELD_FRAMES, read_asset
+from beam_warp.schema.reader import read_asset
+from beam_warp.schema.stage_queries import MAX_HELD_FRAMES
 from beam_warp.schema.writer import write_asset
 
 
@@ -65,8 +66,8 @@ def test_values_of_other_types_and_sizes(tmp_path, text, old, new, message):
 
 
 def test_a_version_of_many_digits(tmp_path, text):
-    with pytest.raises(SchemaVersionError, match=r"schema version 1\.2, got '1\.9{38}' at"):
-        read_all(tmp_path, text, 'beam:schemaVersion = "1.2"', f'beam:schemaVersion = "1.{5000 * "9"}"')
+    with pytest.raises(SchemaVersionError, match=r"schema version 1\.3, got '1\.9{38}' at"):
+        read_all(tmp_path, text, 'beam:schemaVersion = "1.3"', f'beam:schemaVersion = "1.{5000 * "9"}"')
 
 
 @pytest.mark.parametrize(

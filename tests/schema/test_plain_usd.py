@@ -46,7 +46,7 @@ def test_opens_as_ordinary_splats(tmp_path, sequence):
     assert seen["types"]["beam:baseColor"] == "color3f[]"
     assert seen["types"]["beam:ambientOcclusion"] == "float[]"
     assert seen["types"]["beam:ids"] == "int64[]"
-    assert (seen["version"], seen["space"], seen["up"], seen["meters"]) == ("1.2", "lin_rec709_scene", "Y", 1.0)
+    assert (seen["version"], seen["space"], seen["up"], seen["meters"]) == ("1.3", "lin_rec709_scene", "Y", 1.0)
     assert seen["seconds"] == 65 / 24
     assert seen["degree"] == 1
     assert np.array_equal(np.float32(seen["harmonics"]), source[0].radiance.reshape(-1, 3))

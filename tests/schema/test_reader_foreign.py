@@ -227,12 +227,12 @@ def test_versions(tmp_path, sequence):
     path = tmp_path / "a.usdc"
     write_asset(sequence(1), path)
     rewritten_version(path, "1.7")
-    with pytest.warns(UserWarning, match=r"version 1.7 is newer than 1.2: what it added is not read"):
+    with pytest.warns(UserWarning, match=r"version 1.7 is newer than 1.3: what it added is not read"):
         found = read_asset(path, trusted=True)
     assert found.metadata["notes"].startswith("schema version 1.7 is newer")
     for version in ("2.0", "banana", ""):
         rewritten_version(path, version)
-        with broken(r"must have schema version 1.2, got .* at /Asset/Splats\. Upgrade", SchemaVersionError):
+        with broken(r"must have schema version 1.3, got .* at /Asset/Splats\. Upgrade", SchemaVersionError):
             read_asset(path, trusted=True)
 
 

@@ -40,7 +40,7 @@ def test_an_asset_of_1_0_becomes_one_of_today_by_writing_it(tmp_path):
     old = read_asset(OLD_ASSET, trusted=True)
     write_asset(old, tmp_path / "new.usdc")
     new = read_asset(tmp_path / "new.usdc", trusted=True)
-    assert new.metadata["schema_version"] == "1.2"
+    assert new.metadata["schema_version"] == "1.3"
     for frame in range(2):
         for name, array in old[frame].arrays().items():
             assert np.array_equal(array, new[frame].arrays()[name]), name
@@ -53,7 +53,7 @@ def test_a_reader_of_1_0_ignores_what_came_later_and_says_so(tmp_path, sequence,
     known = {name: channel for name, channel in CHANNELS.items() if name not in SINCE_1_1}
     monkeypatch.setattr(reader, "CHANNELS", known)
     monkeypatch.setattr(reader, "SCHEMA_VERSION", "1.0")
-    with pytest.warns(UserWarning, match="schema version 1.2 is newer than 1.0: what it added is not read"):
+    with pytest.warns(UserWarning, match="schema version 1.3 is newer than 1.0: what it added is not read"):
         found = read_asset(tmp_path / "a.usdc", trusted=True)
     for frame in range(2):
         wanted = source[frame].with_arrays(roughness_error=None).arrays()

@@ -17,8 +17,8 @@ class Asset:
         self.folder, self.sequence, self.make_cloud = folder, sequence, make_cloud
         self.open(sequence(3))
 
-    def open(self, source, name="asset.usdc"):
-        write_asset(source, self.folder / name)
+    def open(self, source, name="asset.usdc", **options):
+        write_asset(source, self.folder / name, **options)
         self.stage = Usd.Stage.Open(str(self.folder / name))
         self.splats = self.stage.GetPrimAtPath("/Asset/Splats")
         self.root = self.stage.GetPrimAtPath("/Asset")
@@ -138,6 +138,7 @@ PREPARED = {
     "BEAM-SEQ-007": ids_that_change,
     "BEAM-SEQ-008": one_rotation,
     "BEAM-SEQ-009": lambda asset: numbered(asset, [3, 4, 5]),
+    "BEAM-SEQ-010": lambda asset: asset.open(asset.sequence(3), "keyed.usdc", bounds={}),
     "BEAM-CLIP-001": lambda asset: asset.open_clips(),
     "BEAM-CLIP-002": lambda asset: asset.open_clips(),
     "BEAM-CLIP-003": lambda asset: asset.open_clips(),
@@ -193,6 +194,7 @@ BREAKERS = {
     "BEAM-SEQ-007": constant_topology,
     "BEAM-SEQ-008": negated_quaternions,
     "BEAM-SEQ-009": lambda asset: numbered(asset, [3, 4]),
+    "BEAM-SEQ-010": lambda asset: asset.splats.GetAttribute("beam:ambientOcclusionh").ClearAtTime(2.0),
     "BEAM-CLIP-001": cut_segment,
     "BEAM-CLIP-002": undeclared,
     "BEAM-CLIP-003": gap_in_clip,

@@ -1,0 +1,143 @@
+"""Frames that roughness is found from: no more than change it, and none where views say nothing of it."""
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beam_warp.decomposition import roughness_finder
+from beam_warp.decomposition.roughness_finder import PART, ROUGHNESS_FRAMES, asked_frames, find_roughness
+from beam_warp.materials.roughness import CANDIDATES, RoughnessProfile, evenly_spread, solve_roughness
+
+COUNT = 2000
+POSITIONS = np.random.default_rng(0).uniform(size=(COUNT, 3)).astype(np.float32)
+PLAN = SimpleNamespace(
+    light=SimpleNamespace(prepared=None), source=SimpleNamespace(options=SimpleNamespace(gathering=None))
+)
+
+
+def test_frames_that_are_asked_are_spread_and_the_first_ones_too():
+    assert asked_frames(1) == [0]
+    assert asked_frames(2) == [0, 1]
+    assert asked_frames(5) == [0, 4, 2, 1, 3]
+    assert asked_frames(71)[:3] == [0, 70, 30]
+
+
+@given(st.integers(1, 500))
+def test_every_frame_that_is_asked_is_another_one(count):
+    found = asked_frames(count)
+    assert len(found) == len(set(found)) == min(count, ROUGHNESS_FRAMES)
+    assert set(found) <= set(range(count))
+    assert {0, count - 1} <= set(found)
+
+
+def told(seen, spread):
+    """What halves of views say that see a roughness with normal errors of a spread."""
+    values = np.array(CANDIDATES)
+    halves = np.square((values - seen[..., None]) / spread) / 2.0
+    return RoughnessProfile(np.concatenate([halves.sum(0, keepdims=True), halves]), np.ones(seen.shape[1]))
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """A function that estimates roughness from frames of the given profiles, and says which of these were read."""
+    read = []
+
+    def find(profiles):
+        def measured(cloud, *_, frame, rows, **how):
+            read.append((frame, COUNT if rows is None else len(rows)))
+            return profiles[frame] if rows is None else profiles[frame].of(rows)
+
+        monkeypatch.setattr(roughness_finder, "measure_roughness_profile", measured)
+        log = SimpleNamespace(timer=lambda _: nullcontext(), within=lambda *_: None)
+        frames = (
+            SimpleNamespace(number=number, cloud=_Cloud(), scene=None, points=None, views=None, log=log)
+            for number in range(len(profiles))
+        )
+        read.clear()
+        return find_roughness(PLAN, frames, len(profiles)), read
+
+    return find
+
+
+class _Cloud:
+    positions = POSITIONS
+
+    def __len__(self):
+        return COUNT
+
+
+def frames(count, spread, *, shared=0.0, seed=1):
+    """Profiles of frames whose errors are independent, beside those that all share."""
+    rng = np.random.default_rng(seed)
+    common = 0.5 + shared * rng.normal(size=COUNT)
+    return [told(common + spread * rng.normal(size=(2, COUNT)), spread) for _ in range(count)]
+
+
+class TestFrames:
+    def test_frames_that_say_the_same_are_left_out(self, found):
+        estimate, read = found(frames(1, 0.1) * 8)
+        assert [frame for frame, _ in read] == [0, 1]
+        assert (estimate.report["frames"], estimate.report["frames_left_out"]) == (2, 6)
+        assert estimate.report["left_out_change"] <= PART * np.sqrt(np.mean(estimate.standard_error**2))
+
+    def test_frames_that_differ_are_all_asked(self, found):
+        moving = [told(np.full((2, COUNT), 0.3 + 0.1 * (frame % 2)), 0.05) for frame in range(4)]
+        estimate, read = found(moving)
+        assert len(read) == 4
+        assert (estimate.report["frames_left_out"], estimate.report["left_out_change"]) == (0, 0.0)
+
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_one_frame_or_two_are_not_left_out(self, found, count):
+        profiles = frames(count, 0.1)
+        estimate, read = found(profiles)
+        assert len(read) == count
+        whole = solve_roughness(POSITIONS, profiles[0] if count == 1 else profiles[0] + profiles[1])
+        assert np.array_equal(estimate.roughness, whole.roughness)
+        assert np.array_equal(estimate.standard_error, whole.standard_error)
+
+    def test_the_change_that_is_said_is_that_of_the_frames_left_out(self):
+        """Means of independent numbers: what some frames tell of the others is right, but for a sample's error."""
+        numbers = np.random.default_rng(2).normal(size=(8, 200_000))
+        means = [SimpleNamespace(roughness=numbers[:used].mean(axis=0)) for used in range(1, 9)]
+        for used in (2, 3, 5):
+            said = roughness_finder._change_by_more(means[used - 2], means[used - 1], used, 8)
+            true = np.sqrt(np.mean((means[used - 1].roughness - means[7].roughness) ** 2))
+            assert said == pytest.approx(true, rel=0.01)  # a root mean square of 200,000 is off by 0.16 %
+
+
+class TestPilot:
+    @pytest.fixture(autouse=True)
+    def small_pilot(self, monkeypatch):
+        monkeypatch.setattr(roughness_finder, "PILOT_GAUSSIANS", 200)
+
+    def test_views_that_say_nothing_are_asked_by_few_gaussians_only(self, found):
+        mute = RoughnessProfile(np.zeros((3, COUNT, len(CANDIDATES))), np.ones(COUNT))
+        estimate, read = found([mute] * 3)
+        assert read == [(0, 200)]
+        assert not estimate.informed.any()
+        assert (estimate.report["frames"], estimate.report["frames_left_out"]) == (0, 3)
+        whole = solve_roughness(POSITIONS, mute + mute + mute)
+        # Both are the prior; where all are asked it may be blurred by 0.01, the least step that is tried, beside its
+        # spread of 0.21: by 0.01² / 2 / 0.21² of it.
+        np.testing.assert_allclose(estimate.roughness, whole.roughness, rtol=1.2e-3)
+        np.testing.assert_allclose(estimate.standard_error, whole.standard_error, rtol=1.2e-3)
+
+    def test_views_that_say_something_are_asked_in_full(self, found):
+        estimate, read = found(frames(1, 0.1))
+        assert read == [(0, 200), (0, COUNT)]
+        assert estimate.informed.any()
+
+    def test_a_pilot_that_would_save_little_is_left_out(self, found, monkeypatch):
+        monkeypatch.setattr(roughness_finder, "LEAST_SAVED", 11)
+        assert found(frames(1, 0.1))[1] == [(0, COUNT)]
+
+
+@given(st.integers(1, 3000), st.integers(1, 500))
+def test_rows_of_a_pilot_are_even(count, wanted):
+    rows = evenly_spread(np.random.default_rng(count).normal(size=(count, 3)), wanted)
+    assert (np.diff(rows) > 0).all()
+    assert min(count, wanted) <= len(rows) < 2 * wanted + 1
