@@ -15,7 +15,7 @@ from beam_warp.schema import reader, register
 from beam_warp.schema.keys import departure, key_times
 from beam_warp.schema.layout import to_vt
 from beam_warp.schema.reader import read_asset
-from beam_warp.schema.stage_queries import clip_sets, sample_times
+from beam_warp.schema.stage_queries import clip_sets, frame_times, sample_times
 from beam_warp.schema.validation.mending import mend_stage
 from beam_warp.schema.validation.validator import validate_stage
 from beam_warp.schema.writer import write_asset
@@ -266,6 +266,15 @@ def test_keys_that_say_too_little_are_told(asset, times, topology):
     for time, value in values.items():
         attribute.Set(value, time)
     assert asset.rules() == ["BEAM-SEQ-010"]
+
+
+def test_samples_that_are_far_apart_make_no_frames(asset):
+    """A few bytes could claim so many frames that nobody ends reading them."""
+    asset.prepare("BEAM-SEQ-010")
+    for name in ("positions", "beam:ambientOcclusionh"):
+        asset.splats.GetAttribute(name).Set(asset.splats.GetAttribute(name).Get(0), 1e9)
+    assert frame_times(asset.splats) == [0.0, 1.0, 2.0, 1e9]
+    assert "BEAM-SEQ-010" in asset.rules()
 
 
 def test_one_segment_is_in_memory_at_once(tmp_path):
