@@ -1,6 +1,7 @@
 """What do rays bring where they are needed, instead of as many for every Gaussian: error, bias, time and scores?
 
-    python benchmarks/economy.py [--device cuda:0] [--parts light occlusion bounce frames views] --out JSON
+    python benchmarks/economy.py [--device cuda:0] [--parts light occlusion bounce frames] --out JSON
+    python benchmarks/economy.py --parts views --made DIR --out JSON
 
 Materials of Gaussians on the true surface of three captures and of the demo's are measured with every Gaussian's light
 by as many rays, and by as many as its neighbours' first rays say that it needs. Errors are of the arriving light at
@@ -10,8 +11,9 @@ once its own rays agree; and *occlusion* is what the same rule would bring there
 many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn. *Bounce* is
 the error of the bounced light over all light: without it, by as many rays for each, and by as many as it needs.
 *Frames* is roughness of Gaussians that keep their places on the surface, from all frames and from as many as change it,
-and that of two views, which say nothing of it. *Views* is base colour by all training views and
-by some; its change is relative to the error that it states with all. Seconds of both are those of the processor.
+and that of a white surface under even light, whose views say nothing of it. *Views* is base colour of a reconstruction,
+DIR/NAME/reconstruction as `beam run` leaves it, by all training views and by some; its change is relative to the error
+that it states with all. Seconds of both are those of the processor.
 """
 
 from __future__ import annotations
@@ -26,12 +28,14 @@ from typing import Any
 
 import numpy as np
 import record
+import warp as wp
 from constants_places import changed
 from materials_truth import Materials, PerfectFrame, TruthViews, light_reference
 from numpy.typing import NDArray
 from timing import Task, spread, take_turns
 
 from beam_warp.capture.capture import Capture
+from beam_warp.converters import read
 from beam_warp.decomposition import roughness_finder
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device, upload
@@ -56,17 +60,19 @@ from beam_warp.study.true_surface import SHARP, colored_by_views, gaussians_on_m
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_batches
 from beam_warp.trace.scene import Scene
+from beam_warp.world.axes import change_axes
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.harmonics import SH_C0
 
 CAPTURES = ("walker", "runner", "robot", "demo")
 FIXED = (16, 32, 64, 128, 256)
 TARGETS = (0.025, 0.05, 0.1, 0.2)
 OCCLUSION_TARGETS = (0.01, 0.02, 0.04)
 REPEATS = 5
-VIEW_SHARES = (1.0, 0.75, 0.5)
+VIEW_SHARES, VIEW_RAYS = (1.0, 0.75, 0.5), 16
 
 MUTE_GAUSSIANS = 40_000
-"""Gaussians that two views see: enough for a pilot."""
+"""Gaussians of a white surface: enough for a pilot."""
 
 Errors = Mapping[int, NDArray[np.floating[Any]]]
 """Errors of Gaussians by rays for each."""
@@ -238,9 +244,12 @@ def frames_of(capture: Capture, count: int, device: Any) -> list[dict[str, Any]]
         off = (rows[-1]["found"].roughness - truth)[seen[0].points.seen]
         rows[-1]["psnr"] = float(-20.0 * np.log10(root_mean_square(off)))
     silent = seen_frame(capture, numbers[0], numbers[0], max(count, MUTE_GAUSSIANS), device)
-    two = {key: getattr(silent.views, key)[:2].contiguous() for key in ("colors", "directions")}
-    silent.views = replace(silent.views, **two)
-    for name, saved in (("two views, no pilot", 10**9), ("two views", roughness_finder.LEAST_SAVED)):
+    silent.cloud = silent.cloud.with_arrays(radiance=np.full((len(silent.cloud), 1, 3), 0.5 / SH_C0, np.float32))
+    colors = silent.views.colors.numpy()
+    colors[..., :3] = 1.0
+    silent.views = replace(silent.views, colors=wp.array(colors, dtype=wp.vec4, device=device))
+    light = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0)), device)
+    for name, saved in (("white, no pilot", 10**9), ("white under even light", roughness_finder.LEAST_SAVED)):
         with changed("beam_warp.decomposition.roughness_finder:LEAST_SAVED", saved):
             rows.append(roughness_row(name, [silent], light) | {"of": 1})
     for every, some in (rows[:2], rows[2:]):
@@ -278,46 +287,37 @@ def roughness_row(name: str, seen: list[SimpleNamespace], light: PreparedEnviron
     return {"name": name, "found": found, "seconds": time.process_time() - started, "stated": stated} | told
 
 
-def views_of(capture: Capture, count: int, device: Any) -> list[dict[str, Any]]:
-    """Return base colour and occlusion by all training views of a frame, and by parts of them."""
-    frame = truth_frames(capture)[0]
-    whole = PerfectFrame.of(capture, frame, count, device)
+def views_of(capture: Capture, made: Path, device: Any) -> list[dict[str, Any]]:
+    """Return base colour and occlusion of a reconstruction by all training views of its first frame, and by some."""
+    frame, cloud = truth_frames(capture)[0], change_axes(read(made / "reconstruction" / "gaussians.usda")[0], "rfu")
+    views = [record.view() for record in capture.select(split="train", frames={frame})]
     assert capture.environment_path is not None
     light = PreparedEnvironment(EnvironmentMap.read(capture.environment_path), device)
-    truth, rows, first = TruthViews(capture, frame, SHARP, 2, str(device)), [], None
+    scene, truth = Scene.from_gaussians(cloud, str(device)), TruthViews(capture, frame, SHARP, 2, str(device))
+    rough, options = np.full(len(cloud), 0.5, np.float32), MaterialOptions(sample_count=VIEW_RAYS)
+    rows: list[dict[str, Any]] = []
+    first = None
     for share in VIEW_SHARES:
-        kept = [view for place, view in enumerate(whole.views) if int((place + 1) * share) > int(place * share)]
+        kept = [view for place, view in enumerate(views) if int((place + 1) * share) > int(place * share)]
         started = time.process_time()
-        evidence = view_evidence(whole.cloud, [v.camera for v in kept], kept, options=SHARP, device=str(device))
-        evidence_seconds = time.process_time() - started
-        some = replace(whole, views=kept, evidence=evidence)
-        points, rough = some.points(exact=False), np.full(count, 0.5, np.float32)
-        how = {"options": MaterialOptions(), "views": evidence}
-        measured = measure_materials(whole.cloud, whole.scene, points, rough, light, **how)
-        seconds = time.process_time() - started
-        known = whole.cloud.with_arrays(normal_confidence=points.confidence)
-        color = solve_base_color(known, measured.evidence, light.mean_irradiance)
-        openness, _ = fill_from_neighbors(
-            whole.cloud.positions,
-            measured.ambient_occlusion[:, None],
-            measured.ambient_occlusion_error[:, None],
-            ~points.seen,
-        )
-        score = truth.score(whole.cloud, Materials(color.base_color, openness[:, 0].astype(np.float32)))
+        shown = view_evidence(cloud, [view.camera for view in kept], kept, options=SHARP, device=str(device))
+        row: dict[str, Any] = {"name": f"{len(kept)} views", "evidence_seconds": time.process_time() - started}
+        points = SurfacePoints.seen_by(cloud, shown, scene, "auto")
+        found = measure_materials(cloud, scene, points, rough, light, options=options, views=shown)
+        row["seconds"] = time.process_time() - started
+        known = cloud.with_arrays(normal_confidence=points.confidence)
+        color = solve_base_color(known, found.evidence, light.mean_irradiance)
+        openness = found.ambient_occlusion[:, None], found.ambient_occlusion_error[:, None]
+        filled, _ = fill_from_neighbors(cloud.positions, *openness, ~points.seen)
+        score = truth.score(cloud, Materials(color.base_color, filled[:, 0].astype(np.float32)))
+        row |= {key: score[key]["psnr"] for key in ("base_color", "ambient_occlusion")}
         first = first or color
         change = np.abs(color.base_color - first.base_color) / np.maximum(first.standard_error, 1e-6)
-        row = {
-            "name": f"{len(kept)} views",
-            "views": len(kept),
-            "seconds": seconds,
-            "evidence_seconds": evidence_seconds,
-        }
-        row |= {key: score[key]["psnr"] for key in ("base_color", "ambient_occlusion")}
         rows.append(row | {"change_median": float(np.median(change)), "beyond_error": float((change > 1.0).mean())})
     return rows
 
 
-PARTS = ("light", "occlusion", "bounce", "frames", "views")
+PARTS = ("light", "occlusion", "bounce", "frames")
 
 
 def main() -> None:
@@ -327,7 +327,8 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--reference-rays", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=REPEATS)
-    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
+    parser.add_argument("--parts", nargs="+", default=PARTS, choices=(*PARTS, "views"))
+    parser.add_argument("--made", type=Path, metavar="DIR", help="where reconstructions of the captures are")
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}
@@ -341,7 +342,7 @@ def main() -> None:
             if "frames" in given.parts:
                 rows[name]["frames"] = frames_of(capture, given.gaussians, device)
             if "views" in given.parts:
-                rows[name]["views"] = views_of(capture, given.gaussians, device)
+                rows[name]["views"] = views_of(capture, given.made / name, device)
             record.write_result(given, device, {"captures": rows})
             for row in [*rows[name].get("frames", ()), *rows[name].get("views", ())]:
                 print(name, row, flush=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,8 @@ def keyed(result: Row) -> Rows:
         for row in found["rows"]:
             scale = "every frame" if row["factor"] is None else f"{row['factor']:g}"
             samples = [str(row["samples"][array]) for array in arrays]
-            most = f"{max(row['of_bound'].values()):.2f}" if "of_bound" in row else ""
+            # Bounds of keys are root mean squares: those of what is spread evenly within the bounds of a container.
+            most = f"{math.sqrt(3.0) * max(row['of_bound'].values()):.2f}" if "of_bound" in row else ""
             counted = f"{row['counted_mean']:.2f}, {row['counted_worst']:.2f}"
             numbers = [cell(row["loss"], ".2f"), cell(row["write_seconds_a_frame"], ".2f")]
             first = [name, f"{found['gaussians']:,}", scale, cell(row["kb_a_frame"], ".0f"), *samples, most]

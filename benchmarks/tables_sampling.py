@@ -110,6 +110,36 @@ def economy_bounce(result: Row) -> Rows:
     return rows
 
 
+@table("economy_frames", "economy_frames_cpu.json")
+def economy_frames(result: Row) -> Rows:
+    """Roughness from all frames and from as many as change it; and where views say nothing."""
+    rows: list[list[Any]] = [["", "frames", "s", "roughness", "stated error", "left out: said", "true"]]
+    for name, found in result["captures"].items():
+        for row in found["frames"]:
+            score = f"{row['psnr']:.2f} dB" if "psnr" in row else ""
+            cells = [f"{row['frames']} of {row['of']}", f"{row['seconds']:.1f}", score, f"{row['stated']:.3f}"]
+            said = [f"{row[key]:.4f}" if "change" in row else "" for key in ("left_out_change", "change") if key in row]
+            rows.append([f"{name}, {row['name']}", *cells, *(said if len(said) == 2 else ["", ""])])
+    return rows
+
+
+@table("economy_views", "economy_frames_cpu.json")
+def economy_views(result: Row) -> Rows:
+    """Base colour and occlusion by all training views and by parts of them."""
+    rows: list[list[Any]] = [["", "base colour", "occlusion", "changed", "by more than its error", "s (views)"]]
+    for name, found in result["captures"].items():
+        for row in found["views"]:
+            scores = [f"{row[key]:.2f} dB" for key in ("base_color", "ambient_occlusion")]
+            change = (
+                [f"{row['change_median']:.2f}", f"{100 * row['beyond_error']:.0f} %"]
+                if row["change_median"]
+                else ["", ""]
+            )
+            seconds = f"{row['seconds']:.1f} ({row['evidence_seconds']:.1f})"
+            rows.append([f"{name}, {row['name']}", *scores, *change, seconds])
+    return rows
+
+
 @number("sampling_bias", *BALL_AND_FIGURE)
 def sampling_bias(ball: Row, human: Row) -> float:
     """The largest mean error of the default estimator and of MIS at 64 rays, in its standard errors."""

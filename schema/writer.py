@@ -76,8 +76,8 @@ def write_asset(
         segment_length: Frames in one value clip, and held in memory at once.
         bounds: How far arrays may be from their originals, by name (`beam_warp.schema.keys.departure`); an array that
             is not named must be the same. Arrays then have time samples at keys only, at most `segment_length` frames
-            apart, and those that never leave their bound have none. None writes a sample at every frame, as does a
-            topology other than ``constant``: rows that are not the same Gaussian must not be blended.
+            apart, and those that never leave their bound have none. The topology is then ``constant``: rows that are
+            not the same Gaussian must not be blended. None writes a sample at every frame.
         clips: Clips of this sequence that `write_clip` has written; None to write all here.
 
     Returns:
@@ -96,7 +96,12 @@ def write_asset(
         )
     require_count("segment_length", segment_length)
     register()
-    bounds = bounds if sequence.topology == "constant" and len(sequence) > 1 else None
+    if bounds is not None and len(sequence) > 1 and sequence.topology != "constant":
+        raise InvalidOptionError(
+            f"bounds of keys must go with a constant topology, got {sequence.topology}: its rows are not the same "
+            "Gaussians in every frame. Write a sample at every frame."
+        )
+    bounds = bounds if len(sequence) > 1 else None
     survey = survey_sequence(sequence, bounds) if clips is None else clips.survey
     half = frozenset() if full_float else survey.half
     clipped = len(sequence) > MAX_FRAMES_IN_ONE_LAYER and bool(survey.varying) and target.suffix != ".usdc"

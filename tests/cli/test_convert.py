@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from support.drawn_ball import relightable
 
 from beam_warp import __version__, converters
 from beam_warp.cli.convert import main
@@ -194,3 +195,22 @@ def test_ply_to_ply_costs_neither_warp_nor_usd(person):
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=person, capture_output=True, text=True, timeout=30)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_take_with_keys(tmp_path, capsys):
+    """What moves evenly has two time samples, and every frame is read back within the bounds."""
+    still = relightable(np.random.default_rng(0).normal(size=(30, 3)), ids=np.arange(30))
+    moved = [still.with_arrays(positions=still.positions + np.array([0.02 * frame, 0.0, 0.0])) for frame in range(10)]
+    converters.write(GaussianSequence.from_clouds(moved), tmp_path / "take.usdc")
+    code, out, err = run(tmp_path / "take.usdc", tmp_path / "keyed.usdc", "--keyed", capsys=capsys)
+    assert (code, err) == (0, "")
+    assert "10 frames" in out
+    assert (tmp_path / "keyed.usdc").stat().st_size < (tmp_path / "take.usdc").stat().st_size
+    found, every = (converters.read(tmp_path / name) for name in ("keyed.usdc", "take.usdc"))
+    for cloud, wanted in zip(found, every, strict=True):
+        np.testing.assert_allclose(cloud.positions, wanted.positions, atol=1e-6)  # a rounding of single precision
+    unknown = GaussianSequence.from_clouds([cloud.with_arrays(ids=None) for cloud in moved])
+    converters.write(unknown, tmp_path / "unknown.usdc")
+    code, _, err = run(tmp_path / "unknown.usdc", tmp_path / "no.usdc", "--keyed", capsys=capsys)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "must go with a constant topology, got perFrame" in err

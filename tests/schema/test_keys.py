@@ -10,11 +10,12 @@ from pxr import Usd, Vt
 from scipy.spatial.transform import Rotation
 from support.radiant_cloud import radiant_cloud
 
+from beam_warp.errors import InvalidOptionError
 from beam_warp.schema import reader, register
 from beam_warp.schema.keys import departure, key_times
 from beam_warp.schema.layout import to_vt
 from beam_warp.schema.reader import read_asset
-from beam_warp.schema.stage_queries import clip_sets, sample_times
+from beam_warp.schema.stage_queries import clip_sets, frame_times, sample_times
 from beam_warp.schema.validation.mending import mend_stage
 from beam_warp.schema.validation.validator import validate_stage
 from beam_warp.schema.writer import write_asset
@@ -207,10 +208,9 @@ class TestFiles:
 
     def test_rows_that_are_not_the_same_gaussian_are_never_blended(self, tmp_path):
         clouds = [cloud.with_arrays(ids=None) for cloud in take(12)]
-        write_asset(GaussianSequence.from_clouds(clouds), tmp_path / "a.usdc", bounds=BOUNDS)
-        stage, prim = splats(tmp_path / "a.usdc")
-        assert prim.GetAttribute("positions").GetNumTimeSamples() == 12
-        assert stage.GetPrimAtPath("/Asset").GetAttribute("beam:sequence:sampling").Get() == "everyFrame"
+        with pytest.raises(InvalidOptionError, match="bounds of keys must go with a constant topology, got perFrame"):
+            write_asset(GaussianSequence.from_clouds(clouds), tmp_path / "a.usdc", bounds=BOUNDS)
+        assert [*tmp_path.iterdir()] == []
 
     def test_the_box_of_every_frame_holds_its_kernels(self, tmp_path):
         write_asset(take(20), tmp_path / "a.usdc", bounds={name: 4.0 * bound for name, bound in BOUNDS.items()})
@@ -266,6 +266,15 @@ def test_keys_that_say_too_little_are_told(asset, times, topology):
     for time, value in values.items():
         attribute.Set(value, time)
     assert asset.rules() == ["BEAM-SEQ-010"]
+
+
+def test_samples_that_are_far_apart_make_no_frames(asset):
+    """A few bytes could claim so many frames that nobody ends reading them."""
+    asset.prepare("BEAM-SEQ-010")
+    for name in ("positions", "beam:ambientOcclusionh"):
+        asset.splats.GetAttribute(name).Set(asset.splats.GetAttribute(name).Get(0), 1e9)
+    assert frame_times(asset.splats) == [0.0, 1.0, 2.0, 1e9]
+    assert "BEAM-SEQ-010" in asset.rules()
 
 
 def test_one_segment_is_in_memory_at_once(tmp_path):
