@@ -551,7 +551,7 @@ UNTUNED = {
         beam_warp.materials.pilot: RATE SHARE
         beam_warp.reconstruction.masks: FEWEST_VIEWS SIDE SAMPLES WINDOW
         beam_warp.reconstruction.rig: MOST_LEFT_OUT
-        beam_warp.reconstruction.photometry: CHANCE COSINES
+        beam_warp.reconstruction.photometry: CHANCE COSINES EXPOSURE BALANCE
         beam_warp.materials.light_fits: CHANCE
         beam_warp.materials.agreement: CUT_PART UNITS
         beam_warp.kernels.materials.pixel_surfaces: LEAST_FACING
@@ -591,7 +591,8 @@ UNTUNED = {
         beam_warp.reconstruction.stereo: LEVELS SMALLEST_SIDE LEAST_PIXELS
         beam_warp.reconstruction.unmasked: PIXELS
         beam_warp.kernels.reconstruction.patch_match: STEP SIDE SAMPLES
-        beam_warp.reconstruction.photometry: FEWEST_CAMERAS FEWEST_POINTS MOST_POINTS LEAST_VIEWS ROUNDS SETTLED
+        beam_warp.reconstruction.photometry: FEWEST_CAMERAS FEWEST_POINTS FIRST_POINTS MOST_POINTS LEAST_VIEWS
+        beam_warp.reconstruction.photometry: ROUNDS SETTLED
         beam_warp.reconstruction.photometry: LEAST_VARIANCE
         beam_warp.reconstruction.parameters: SMALLEST_SCALE LOGIT_LIMIT DEAD_LOGIT
         beam_warp.reconstruction.targets: CROP_STEP

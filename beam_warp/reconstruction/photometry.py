@@ -40,6 +40,7 @@ from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.color import LUMINANCE
+from beam_warp.image.metrics import root_mean_square
 from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS, blurred_environment
 from beam_warp.reconstruction.initial import view_samples
@@ -65,8 +66,8 @@ MODEL_ERROR = 0.015
 """Error of the logarithms of exposures that halves of the points share, because the surface is wrong: cameras of
 walker, runner and robot, whose exposures are equal, seem to differ by 0.006, 0.007 and 0.018 (root mean square)."""
 
-MOST_POINTS = 1_024
-"""Most points that are compared, evenly chosen."""
+FIRST_POINTS, MOST_POINTS = 1_024, 4_096
+"""Most points that are compared, evenly chosen: at first, and where these say that something may be wrong."""
 
 FEWEST_POINTS = 64
 """Fewest points that tell gains."""
@@ -90,6 +91,10 @@ LEAST_SPREAD = 0.01
 """Least standard deviation of a colour that is assumed, of itself: that of eight bits and of filters."""
 
 
+EXPOSURE, BALANCE = np.full((3, 1), 1.0 / 3.0), np.eye(3) - 1.0 / 3.0
+"""Exposure and white balance as linear functions of the logarithms of three gains, ``(3, 1)`` and ``(3, 3)``."""
+
+
 @dataclass(frozen=True, eq=False)
 class SolvedGains:
     """Natural logarithms of the gains of views, each of mean 0 over the views, ``(V, 3)``.
@@ -107,6 +112,10 @@ class SolvedGains:
     def error(self, what: NDArray[np.float64]) -> float:
         """Return the standard error, root mean square, of linear functions of the logarithms, ``(3, k)``."""
         return float(np.sqrt(np.mean(np.square(self.apart @ what)) + np.mean(np.square(self.gloss @ what))))
+
+    def may_be_wrong(self) -> bool:
+        """Return whether exposures or white balances differ by more than their standard error."""
+        return any(root_mean_square(self.logs @ what) > self.error(what) for what in (EXPOSURE, BALANCE))
 
 
 def may_compare(views: Sequence[CapturedView]) -> bool:
@@ -147,7 +156,9 @@ def find_exposures(
     away = np.stack([view.camera.position for view in views])[:, None] - positions
     away /= np.linalg.norm(away, axis=2, keepdims=True)
     gloss = highlights(normals[rows].astype(np.float64), away, environment, device)
-    solved = solve_gains(samples[:, rows], gloss)
+    solved = solve_gains(samples[:, rows], gloss, FIRST_POINTS)
+    if solved is not None and solved.may_be_wrong():
+        solved = solve_gains(samples[:, rows], gloss, MOST_POINTS)
     return None if solved is None else judged(names, solved)
 
 
@@ -189,12 +200,15 @@ def highlights(
     return np.stack(seen, axis=-1)
 
 
-def solve_gains(samples: NDArray[np.floating], gloss: NDArray[np.floating]) -> SolvedGains | None:
+def solve_gains(
+    samples: NDArray[np.floating], gloss: NDArray[np.floating], most: int = FIRST_POINTS
+) -> SolvedGains | None:
     """Solve for the gains of views.
 
     Args:
         samples: Scene-linear colour and weight of each point in each view, 0 where it is not seen, ``(V, N, 4)``.
         gloss: Highlights of a smooth dielectric for each roughness, ``(V, N, 3, K)``.
+        most: Most points that are compared, evenly chosen.
 
     Returns:
         The gains, 0 of views that share nothing with others; None where there are fewer than `FEWEST_POINTS`.
@@ -208,7 +222,7 @@ def solve_gains(samples: NDArray[np.floating], gloss: NDArray[np.floating]) -> S
     rows = np.flatnonzero(known)
     if len(rows) < FEWEST_POINTS:
         return None
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)]
     scale = means[rows, None, :]
     relative, seen = colors[:, rows].transpose(1, 0, 2) / scale, weights[:, rows].T
     shine = gloss[:, rows].transpose(1, 0, 2, 3) / scale[..., None]
@@ -294,10 +308,8 @@ def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
         names: Names of the cameras.
         solved: Their gains.
     """
-    mean = np.full((3, 1), 1.0 / 3.0)
-    rest = np.eye(3) - 1.0 / 3.0
-    exposures, balances = solved.logs @ mean, solved.logs @ rest
-    exposure_error, balance_error = solved.error(mean), solved.error(rest)
+    exposures, balances = solved.logs @ EXPOSURE, solved.logs @ BALANCE
+    exposure_error, balance_error = solved.error(EXPOSURE), solved.error(BALANCE)
     kept = _part_beyond_chance(exposures, exposure_error, MODEL_ERROR, len(names) - 1)
     kept_balance = _part_beyond_chance(balances, balance_error, 0.0, 2 * (len(names) - 1))
     gains = np.exp(kept * exposures + kept_balance * balances)

@@ -81,6 +81,7 @@ def test_gloss_is_told_from_gains(lit, rng):
     for what in (MEAN, REST):
         assert error_of(solved.logs, logs, what) < 0.5 * error_of(matte, logs, what)
         assert error_of(solved.logs, logs, what) < 2.0 * solved.error(what)
+    assert solved.may_be_wrong()
     found = judged([str(view) for view in range(VIEWS)], solved)
     undone = np.log([camera.gains for camera in found.cameras])
     assert found.exposure_undone
@@ -92,6 +93,7 @@ def test_gloss_is_told_from_gains(lit, rng):
 def test_sound_views_stay_to_the_bit(lit):
     diffuse, shine, weights, gloss = lit
     solved = solve_gains(seen(diffuse + shine, weights, np.zeros((VIEWS, 3))), gloss)
+    assert not solved.may_be_wrong()
     found = judged([str(view) for view in range(VIEWS)], solved)
     assert (found.exposure_undone, found.balance_undone) == (False, False)
     assert {camera.gains for camera in found.cameras} == {(1.0, 1.0, 1.0)}
@@ -114,6 +116,17 @@ def test_each_is_judged_by_its_own_evidence(lit, rng):
     assert (found.exposure_undone, found.balance_undone) == (True, False)
     for camera in found.cameras:
         np.testing.assert_allclose(camera.gains, camera.gains[0], rtol=1e-12)
+
+
+def test_more_points_tell_gains_better(lit, rng):
+    """Eight times as many points of the same noise: about a third of the error."""
+    diffuse, _, weights, gloss = lit
+    logs = drawn_gains(rng, 0.2, 0.05)
+    noise = 1.0 + 0.05 * rng.normal(size=(VIEWS, POINTS, 3))
+    few, all_of_them = (
+        solve_gains(seen(diffuse * noise, weights, logs), gloss, most) for most in (POINTS // 8, POINTS)
+    )
+    assert error_of(all_of_them.logs, logs, np.eye(3)) < 0.6 * error_of(few.logs, logs, np.eye(3))
 
 
 def test_a_view_that_shares_nothing_says_nothing(lit, rng):
