@@ -11,9 +11,9 @@ once its own rays agree; and *occlusion* is what the same rule would bring there
 many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn. *Bounce* is
 the error of the bounced light over all light: without it, by as many rays for each, and by as many as it needs.
 *Frames* is roughness of Gaussians that keep their places on the surface, from all frames and from as many as change it,
-and what a pilot costs the first capture, and saves a white ball under even light, which says nothing of it. *Views* is base colour of a reconstruction,
-DIR/NAME/reconstruction as `beam run` leaves it, by all training views and by some; its change is relative to the error
-that it states with all. Seconds of both are those of the processor.
+and what a pilot costs the first capture, and saves a white ball under even light, which says nothing of it. *Views* is
+base colour of a reconstruction, DIR/NAME/reconstruction as `beam run` leaves it, by all training views and by some; its
+change is relative to the error that it states with all. Seconds of both are those of the processor.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 import record
-import warp as wp
 from constants_places import changed
 from materials_truth import Materials, PerfectFrame, TruthViews, light_reference
 from numpy.typing import NDArray
