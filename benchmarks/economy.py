@@ -11,9 +11,9 @@ once its own rays agree; and *occlusion* is what the same rule would bring there
 many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn. *Bounce* is
 the error of the bounced light over all light: without it, by as many rays for each, and by as many as it needs.
 *Frames* is roughness of Gaussians that keep their places on the surface, from all frames and from as many as change it,
-and that of a white surface under even light, whose views say nothing of it. *Views* is base colour of a reconstruction,
-DIR/NAME/reconstruction as `beam run` leaves it, by all training views and by some; its change is relative to the error
-that it states with all. Seconds of both are those of the processor.
+and what a pilot costs the first capture, and saves a white ball under even light, which says nothing of it. *Views* is
+base colour of a reconstruction, DIR/NAME/reconstruction as `beam run` leaves it, by all training views and by some; its
+change is relative to the error that it states with all. Seconds of both are those of the processor.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 import record
-import warp as wp
 from constants_places import changed
 from materials_truth import Materials, PerfectFrame, TruthViews, light_reference
 from numpy.typing import NDArray
@@ -39,6 +38,7 @@ from beam_warp.converters import read
 from beam_warp.decomposition import roughness_finder
 from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device, upload
+from beam_warp.image.color import LINEAR_REC709
 from beam_warp.image.metrics import root_mean_square
 from beam_warp.jobs.progress import JobLog
 from beam_warp.light.prepared import PreparedEnvironment
@@ -53,7 +53,7 @@ from beam_warp.materials.light_rays import (
     lit_points,
     mean_radiance,
 )
-from beam_warp.materials.normals import SurfacePoints
+from beam_warp.materials.normals import SurfaceNormals, SurfacePoints
 from beam_warp.materials.pilot import rays_needed
 from beam_warp.reconstruction.scores import read_truth_mesh, truth_frames
 from beam_warp.study.true_surface import SHARP, colored_by_views, gaussians_on_mesh
@@ -61,8 +61,10 @@ from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.rays import ray_batches
 from beam_warp.trace.scene import Scene
 from beam_warp.world.axes import change_axes
+from beam_warp.world.directions import even_directions
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.harmonics import SH_C0
+from beam_warp.world.shapes import TiledSurface, tile
 
 CAPTURES = ("walker", "runner", "robot", "demo")
 FIXED = (16, 32, 64, 128, 256)
@@ -71,8 +73,8 @@ OCCLUSION_TARGETS = (0.01, 0.02, 0.04)
 REPEATS = 5
 VIEW_SHARES, VIEW_RAYS = (1.0, 0.75, 0.5), 16
 
-MUTE_GAUSSIANS = 40_000
-"""Gaussians of a white surface: enough for a pilot."""
+PILOTED = 40_000
+"""Gaussians of subjects that have a pilot."""
 
 Errors = Mapping[int, NDArray[np.floating[Any]]]
 """Errors of Gaussians by rays for each."""
@@ -243,18 +245,47 @@ def frames_of(capture: Capture, count: int, device: Any) -> list[dict[str, Any]]
             rows.append(roughness_row(name, seen, light) | {"of": len(seen)})
         off = (rows[-1]["found"].roughness - truth)[seen[0].points.seen]
         rows[-1]["psnr"] = float(-20.0 * np.log10(root_mean_square(off)))
-    silent = seen_frame(capture, numbers[0], numbers[0], max(count, MUTE_GAUSSIANS), device)
-    silent.cloud = silent.cloud.with_arrays(radiance=np.full((len(silent.cloud), 1, 3), 0.5 / SH_C0, np.float32))
-    colors = silent.views.colors.numpy()
-    colors[..., :3] = 1.0
-    silent.views = replace(silent.views, colors=wp.array(colors, dtype=wp.vec4, device=device))
-    light = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0)), device)
-    for name, saved in (("white, no pilot", 10**9), ("white under even light", roughness_finder.LEAST_SAVED)):
-        with changed("beam_warp.decomposition.roughness_finder:LEAST_SAVED", saved):
-            rows.append(roughness_row(name, [silent], light) | {"of": 1})
-    for every, some in (rows[:2], rows[2:]):
-        some["change"] = root_mean_square(some["found"].roughness - every["found"].roughness)
+    return compared(rows)
+
+
+def compared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows without their estimates, and by how much the other ones differ from the first one."""
+    for row in rows[1:]:
+        row["change"] = root_mean_square(row["found"].roughness - rows[0]["found"].roughness)
     return [{key: value for key, value in row.items() if key != "found"} for row in rows]
+
+
+def pilot_of(capture: Capture, device: Any) -> dict[str, list[dict[str, Any]]]:
+    """Return what a pilot costs where views say something, and saves where they say nothing: on a white ball."""
+    assert capture.environment_path is not None
+    light = PreparedEnvironment(EnvironmentMap.read(capture.environment_path), device)
+    even = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0)), device)
+    frame = truth_frames(capture)[0]
+    subjects = {
+        "walker": (seen_frame(capture, frame, frame, PILOTED, device), light),
+        "white ball": (white_ball(PILOTED, device), even),
+    }
+    found = {}
+    for name, (seen, shining) in subjects.items():
+        rows = []
+        for words, saved in (("without a pilot", 10**9), ("with a pilot", roughness_finder.LEAST_SAVED)):
+            with changed("beam_warp.decomposition.roughness_finder:LEAST_SAVED", saved):
+                rows.append(roughness_row(words, [seen], shining) | {"of": 1})
+        found[name] = compared(rows)
+    return found
+
+
+def white_ball(count: int, device: Any) -> SimpleNamespace:
+    """Return a ball that is as bright as an even light: it looks alike from everywhere, whatever its roughness."""
+    places = even_directions(count)
+    shown = np.full((count, 1, 3), 0.5 / SH_C0, np.float32)
+    ball = tile((TiledSurface(places, places, float(np.sqrt(4.0 * np.pi / count))),))
+    cloud = ball.with_arrays(radiance=shown, radiance_color_space=LINEAR_REC709)
+    scene, sure = Scene.from_gaussians(cloud, str(device)), np.ones(count, np.float32)
+    surface = SurfaceNormals(places.astype(np.float32), sure, sure < 0.0)
+    points = SurfacePoints.at_centers(cloud, scene, surface, "auto")
+    log = JobLog(lambda *_: None, 1, device)
+    return SimpleNamespace(number=0, cloud=cloud, scene=scene, points=points, views=None, log=log)
 
 
 def seen_frame(capture: Capture, number: int, first: int, count: int, device: Any) -> SimpleNamespace:
@@ -332,6 +363,7 @@ def main() -> None:
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}
+    pilot: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         for name in given.captures:
             if name == "demo":
@@ -340,10 +372,11 @@ def main() -> None:
                 capture = Capture.read(Path(given.data) / "captures" / name)
             rows[name] = {}
             if "frames" in given.parts:
+                pilot = pilot or pilot_of(capture, device)
                 rows[name]["frames"] = frames_of(capture, given.gaussians, device)
             if "views" in given.parts:
                 rows[name]["views"] = views_of(capture, given.made / name, device)
-            record.write_result(given, device, {"captures": rows})
+            record.write_result(given, device, {"captures": rows, "pilot": pilot})
             for row in [*rows[name].get("frames", ()), *rows[name].get("views", ())]:
                 print(name, row, flush=True)
             if not {"light", "occlusion", "bounce"} & {*given.parts}:

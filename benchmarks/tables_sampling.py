@@ -112,10 +112,11 @@ def economy_bounce(result: Row) -> Rows:
 
 @table("economy_frames", "economy_frames_cpu.json")
 def economy_frames(result: Row) -> Rows:
-    """Roughness from all frames and from as many as change it; and where views say nothing."""
+    """Roughness from all frames and from as many as change it; and what a pilot costs and saves."""
     rows: list[list[Any]] = [["", "frames", "s", "roughness", "stated error", "left out: said", "true"]]
-    for name, found in result["captures"].items():
-        for row in found["frames"]:
+    captures = {name: found["frames"] for name, found in result["captures"].items()}
+    for name, found in (*captures.items(), *result["pilot"].items()):
+        for row in found:
             score = f"{row['psnr']:.2f} dB" if "psnr" in row else ""
             cells = [f"{row['frames']} of {row['of']}", f"{row['seconds']:.1f}", score, f"{row['stated']:.3f}"]
             said = [f"{row[key]:.4f}" if "change" in row else "" for key in ("left_out_change", "change") if key in row]

@@ -28,11 +28,11 @@ from beam_warp.materials.roughness import (
 ROUGHNESS_FRAMES = 8
 """Most frames of persistent Gaussians that roughness is found from: more add little that is new."""
 
-PILOT_GAUSSIANS = 4096
+PILOT_GAUSSIANS = 2048
 """Gaussians by which it is told whether views say anything of roughness, and whether more frames would change it."""
 
-LEAST_SAVED = 8
-"""How many times as many Gaussians a frame must have for a pilot: it then costs an eighth of a frame at most."""
+LEAST_SAVED = 16
+"""How many times as many Gaussians a frame must have for a pilot: it then costs a sixteenth of a frame at most."""
 
 PART = 0.1
 """Part of its own stated error by which leaving out frames may change roughness: the mean square of its error then

@@ -112,12 +112,12 @@ class TestFrames:
 class TestPilot:
     @pytest.fixture(autouse=True)
     def small_pilot(self, monkeypatch):
-        monkeypatch.setattr(roughness_finder, "PILOT_GAUSSIANS", 200)
+        monkeypatch.setattr(roughness_finder, "PILOT_GAUSSIANS", 100)
 
     def test_views_that_say_nothing_are_asked_by_few_gaussians_only(self, found):
         mute = RoughnessProfile(np.zeros((3, COUNT, len(CANDIDATES))), np.ones(COUNT))
         estimate, read = found([mute] * 3)
-        assert read == [(0, 200)]
+        assert read == [(0, 100)]
         assert not estimate.informed.any()
         assert (estimate.report["frames"], estimate.report["frames_left_out"]) == (0, 3)
         whole = solve_roughness(POSITIONS, mute + mute + mute)
@@ -128,11 +128,11 @@ class TestPilot:
 
     def test_views_that_say_something_are_asked_in_full(self, found):
         estimate, read = found(frames(1, 0.1))
-        assert read == [(0, 200), (0, COUNT)]
+        assert read == [(0, 100), (0, COUNT)]
         assert estimate.informed.any()
 
     def test_a_pilot_that_would_save_little_is_left_out(self, found, monkeypatch):
-        monkeypatch.setattr(roughness_finder, "LEAST_SAVED", 11)
+        monkeypatch.setattr(roughness_finder, "LEAST_SAVED", 21)
         assert found(frames(1, 0.1))[1] == [(0, COUNT)]
 
 

@@ -186,6 +186,14 @@ class TestFiles:
                 assert np.array_equal(alone.GetAttribute(name).Get(frame), prim.GetAttribute(name).Get(frame)), name
         del stage
 
+    def test_clips_are_blended_into_each_other(self, tmp_path):
+        write_asset(take(65), tmp_path / "a.usda", bounds=BOUNDS)
+        stage, prim = splats(tmp_path / "a.usda")
+        before, between, after = (np.asarray(prim.GetAttribute("positions").Get(time)) for time in (29.0, 29.5, 30.0))
+        np.testing.assert_allclose(between, 0.5 * (before + after), atol=1e-6)  # roundings of coordinates of about 3
+        assert not np.array_equal(before, after)
+        del stage
+
     def test_what_never_leaves_its_bound_is_written_once(self, tmp_path):
         write_asset(take(12, noise=1e-3), tmp_path / "a.usdc", bounds=BOUNDS | {"normals": 2.0})
         stage, prim = splats(tmp_path / "a.usdc")
