@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
@@ -254,6 +253,8 @@ def solve_roughness(
         raise InvalidArrayError(
             f"positions must have shape ({len(profile.views)}, 3), got {places.shape}. Take those of one of the frames."
         )
+    from scipy.interpolate import CubicSpline  # with scipy.optimize; a take starts without them
+
     known = np.flatnonzero(profile.views > 0.0)
     if not len(known):
         chosen = prior or RoughnessPrior()

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from beam_warp.checks import require_number
 from beam_warp.errors import AssetFormatError, MissingFileError
 from beam_warp.image.files import read_image
-from beam_warp.mesh.files import read_mesh
 from beam_warp.world.gaussians import GaussianCloud
+
+if TYPE_CHECKING:
+    import trimesh
 
 MAX_TEXELS = 1 << 26
 """Largest texture, in texels, that is projected: 8192 x 8192."""
@@ -104,6 +106,8 @@ def textured_roughness(cloud: GaussianCloud, texture: Path, mesh: Path) -> NDArr
 
     Source: BEAM §3.2, "each valid pixel of the texture is mapped back to the world …".
     """
+    from beam_warp.mesh.files import read_mesh  # with trimesh
+
     if not mesh.is_file():
         raise MissingFileError(f"roughness mesh must be an existing file, got {mesh}. Check the path.")
     image = read_image(texture)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
-
-import trimesh
+from typing import TYPE_CHECKING, Any, Literal
 
 from beam_warp.checks import require_choice, require_count
 from beam_warp.device.arrays import resolve_device
@@ -20,6 +18,9 @@ from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.camera import Camera
 from beam_warp.world.framing import bulk
 from beam_warp.world.gaussians import GaussianCloud
+
+if TYPE_CHECKING:
+    import trimesh
 
 DEPTHS = ("median", "mean")
 COLORS = ("none", "base_color", "radiance")

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 import warp as wp
 from numpy.typing import NDArray
 from warp.geometry import sparse_marching_cubes_from_cells
@@ -31,6 +30,9 @@ from beam_warp.kernels.mesh.tsdf import (
 )
 from beam_warp.mesh.depths import DepthImages, DepthView
 from beam_warp.mesh.topology import face_parts
+
+if TYPE_CHECKING:
+    import trimesh
 
 MAX_BLOCKS = 2**18
 """Most blocks of 8^3 voxels, 8 kB each: 2.1 GB of distances, weights and flags."""
@@ -95,6 +97,8 @@ def fuse_depths(
         points, faces = _extract(images, keys, width)
         points, faces = _largest_parts(points, faces, smallest_part)
         colors = _vertex_colors(images, points, width) if len(images.colors) else None
+    import trimesh  # with networkx, which take long
+
     mesh = trimesh.Trimesh(points.astype(np.float64) + images.origin, faces, vertex_colors=colors, process=False)
     mesh.metadata["voxel"] = width
     return mesh

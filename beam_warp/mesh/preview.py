@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 import warp as wp
 from numpy.typing import NDArray
 
@@ -16,6 +15,9 @@ from beam_warp.image.files import display_image
 from beam_warp.kernels.mesh.preview import launch_shade_mesh
 from beam_warp.mesh.depths import depth_camera
 from beam_warp.world.camera import Camera
+
+if TYPE_CHECKING:
+    import trimesh
 
 CLAY = (0.62, 0.60, 0.57)
 """Linear colour of a mesh without one."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
-from trimesh.graph import connected_component_labels
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ def mesh_report(mesh: trimesh.Trimesh) -> MeshReport:
     distinct, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
     open_edges = distinct[uses == 1]
     ends = np.stack([open_edges // max(count, 1), open_edges % max(count, 1)], axis=1)
-    rims = np.bincount(connected_component_labels(ends, count)[ends[:, 0]]) if len(ends) else ends
+    rims = np.bincount(_parts_of(ends, count)[ends[:, 0]]) if len(ends) else ends
     return MeshReport(
         count,
         len(faces),
@@ -66,4 +69,10 @@ def mesh_report(mesh: trimesh.Trimesh) -> MeshReport:
 def face_parts(faces: ArrayLike, vertex_count: int) -> NDArray[np.integer[Any]]:
     """Return the number of the connected part that each face belongs to, ``(F,)``; parts share no vertex."""
     index = np.asarray(faces).reshape(-1, 3)
-    return connected_component_labels(np.concatenate([index[:, :2], index[:, 1:]]), vertex_count)[index[:, 0]]
+    return _parts_of(np.concatenate([index[:, :2], index[:, 1:]]), vertex_count)[index[:, 0]]
+
+
+def _parts_of(edges: NDArray[np.integer[Any]], vertex_count: int) -> NDArray[np.int32]:
+    """Return the number of the part of a graph that each vertex belongs to."""
+    pattern = (np.ones(len(edges), bool), (edges[:, 0], edges[:, 1]))
+    return connected_components(coo_matrix(pattern, (vertex_count, vertex_count)), directed=False)[1]

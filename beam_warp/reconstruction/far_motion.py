@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 import warp as wp
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -125,6 +124,8 @@ def pose_on_hull(
     nodes = usable[select_joints(cloud.positions[usable], min(MOST_NODES, len(usable)))]
     rest, facing = cloud.positions[nodes].astype(np.float64), normals[nodes].astype(np.float64)
     graph = JointGraph.build(rest, normals=facing, smallest_cosine=smallest_cosine)
+    import trimesh  # motion that far is rare
+
     points, faces, *_ = trimesh.sample.sample_surface(hull, POINTS_PER_NODE * len(nodes), seed=0)
     first = carried.joints[:, 0]
     turns = Rotation.from_quat(start.rotations[first[nodes]])

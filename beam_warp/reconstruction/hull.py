@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import trimesh
 import warp as wp
 from numpy.typing import NDArray
 from warp.geometry import sparse_marching_cubes_from_cells
@@ -33,6 +33,9 @@ from beam_warp.kernels.reconstruction.visual_hull import (
     launch_judge_blocks,
 )
 from beam_warp.raster.layout import ViewLayout
+
+if TYPE_CHECKING:
+    import trimesh
 
 MIN_RESOLUTION = 16
 MAX_RESOLUTION = 1024
@@ -65,12 +68,21 @@ class VisualHull:
     """A visual hull.
 
     Attributes:
-        mesh: Surface of the hull [m], closed, faces outward.
+        vertices: Of its surface [m], ``(V, 3)`` float32.
+        faces: Vertex indices, closed, outward, ``(F, 3)`` int32.
         voxel: Size of the cells that the surface was found on [m].
     """
 
-    mesh: trimesh.Trimesh
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
     voxel: float
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """The surface, for whoever measures or samples it."""
+        import trimesh  # with networkx, which take longer to import than a hull to carve
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 def visual_hull(
@@ -133,10 +145,10 @@ def visual_hull(
     smallest = min(min(view.camera.width, view.camera.height) for view in used)
     factor = int(np.clip(voxel * pixels / VOXEL_PIXELS, 1, smallest))
     cones = _Cones(used, factor, agreeing, target)
-    mesh = cones.carve(lower, voxel, blocks)
-    if mesh.is_empty:
+    surface = cones.carve(lower, voxel, blocks)
+    if surface is None:
         raise _no_volume(cones, np.stack([lower, upper]))
-    return VisualHull(mesh, voxel)
+    return VisualHull(*surface, voxel)
 
 
 def masked_views(views: Sequence[CapturedView]) -> tuple[list[CapturedView], list[CapturedView]]:
@@ -255,15 +267,17 @@ class _Cones:
         launch_judge_blocks(len(states), _grid(lower, size, count), self.silhouettes, states, self.device)
         return states.numpy().reshape(count)
 
-    def carve(self, lower: NDArray[np.float64], voxel: float, count: NDArray[Any]) -> trimesh.Trimesh:
-        """Return the surface on a grid of blocks of voxels."""
+    def carve(
+        self, lower: NDArray[np.float64], voxel: float, count: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]] | None:
+        """Return vertices and faces of the surface on a grid of blocks of voxels; None if there is none."""
         states = self.judge(lower, voxel * BLOCK, count)
         for axis in range(3):  # the grid's outermost points count as outside, so that there is surface next to them
             outermost = np.moveaxis(states, axis, 0)[[0, -1]]
             np.moveaxis(states, axis, 0)[[0, -1]] = np.where(outermost == OUTSIDE, OUTSIDE, SURFACE)
         blocks = np.argwhere(states == SURFACE).astype(np.int32)
         if not len(blocks):
-            return trimesh.Trimesh()
+            return None
         device = self.device
         subscripts = upload(blocks, wp.vec3i, device)
         depths = wp.empty(len(blocks) * BLOCK_POINTS, dtype=float, device=device)
@@ -274,13 +288,13 @@ class _Cones:
         wp.utils.array_scan(crossed, crossed, inclusive=True)
         cell_count = int(crossed[-1:].numpy()[0])
         if cell_count == 0:
-            return trimesh.Trimesh()
+            return None
         cells = wp.empty(cell_count, dtype=wp.vec3i, device=device)
         corners = wp.empty((cell_count, 8), dtype=float, device=device)
         launch_gather_cells(len(crossed), subscripts, depths, crossed, cells, corners, device)
         vertices, faces = sparse_marching_cubes_from_cells(cells, corners, grid.origin, voxel, device=device)
         # Depth grows inwards, so Warp's faces, which turn towards larger values, turn in.
-        return trimesh.Trimesh(vertices.numpy(), faces.numpy().reshape(-1, 3)[:, ::-1], process=False)
+        return vertices.numpy(), faces.numpy().reshape(-1, 3)[:, ::-1]
 
 
 def _no_volume(cones: _Cones, box: NDArray[np.float64]) -> InvalidArrayError:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
@@ -22,9 +22,12 @@ from beam_warp.kernels.reconstruction.seen_colors import SeenImage, launch_agree
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays
-from beam_warp.reconstruction.hull import masked_views, viewing_focus, visual_hull
+from beam_warp.reconstruction.hull import VisualHull, masked_views, viewing_focus, visual_hull
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
 from beam_warp.world.harmonics import SH_C0
+
+if TYPE_CHECKING:
+    import trimesh
 
 DISC_WIDTH = 0.7
 """Standard deviation across a disc, in spacings: neighbours overlap, so that light does not pass between them."""
@@ -129,8 +132,8 @@ def initial_gaussians(
 
 def _discs(views: Sequence[CapturedView], count: int, device: str, seed: int) -> GaussianCloud:
     """Return discs on the visual hull, with its normals."""
-    mesh = visual_hull(views, device=device).mesh
-    return surface_discs(*even_surface_points(mesh, count, device=device, seed=seed))
+    hull = visual_hull(views, device=device)
+    return surface_discs(*even_surface_points(hull, count, device=device, seed=seed))
 
 
 def surface_discs(
@@ -174,7 +177,7 @@ def _balls(
 
 
 def even_surface_points(
-    mesh: trimesh.Trimesh, count: int, *, device: str | None = None, seed: int = 0
+    mesh: trimesh.Trimesh | VisualHull, count: int, *, device: str | None = None, seed: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
     """Spread points evenly over a mesh.
 

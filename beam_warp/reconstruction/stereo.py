@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 import warp as wp
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -34,6 +33,9 @@ from beam_warp.mesh.depths import DepthImages, DepthView
 from beam_warp.mesh.fusion import fuse_depths
 from beam_warp.reconstruction.hull import viewing_focus
 from beam_warp.world.camera import Camera
+
+if TYPE_CHECKING:
+    import trimesh
 
 LEVELS = 3
 """Most sizes of images, each half of the next: the search begins with the smallest, where the plain has texture."""

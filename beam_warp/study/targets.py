@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import nnls
 
 from beam_warp.checks import require_number
 from beam_warp.errors import InvalidOptionError
@@ -192,6 +191,8 @@ def fitted(features: ArrayLike, values: ArrayLike) -> NDArray[np.float64]:
 
     Source: Lawson and Hanson 1974.
     """
+    from scipy.optimize import nnls  # which few commands need
+
     rows, costs = np.asarray(features, np.float64), np.maximum(np.asarray(values, np.float64), 1e-30)
     scales = np.maximum(np.abs(rows).max(axis=0), 1e-300)
     return nnls(rows / scales / costs[:, None], np.ones(len(costs)))[0] / scales
