@@ -157,18 +157,21 @@ def inspect_capture(
     cameras = {name: cameras[name] for name in sorted(cameras)}
     trained = {record.camera_name for record in training}
     rig = {name: camera for name, camera in cameras.items() if name in trained}
-    volume, blind = judge_cameras(rig, SPLIT, findings)
-    left_out = {record.name for record in training if record.camera_name in blind}
-    left_out |= _judge_files(capture, findings)
-    chosen = [record for record in _sample(capture, max_images) if record.name not in left_out]
+    sample = _sample(capture, max_images)
     glimpses, damaged = [], []
-    with ThreadPoolExecutor(_reader_count(chosen)) as readers:
-        for index, found in enumerate(readers.map(_glimpse_or_error, chosen)):
-            progress("images", index + 1, len(chosen))
+    with ThreadPoolExecutor(_reader_count(sample)) as readers:
+        looked_at = readers.map(_glimpse_or_error, sample)  # while cameras and files are judged
+        volume, blind = judge_cameras(rig, SPLIT, findings)
+        left_out = {record.name for record in training if record.camera_name in blind}
+        left_out |= _judge_files(capture, findings)
+        for index, (record, found) in enumerate(zip(sample, looked_at, strict=True)):
+            progress("images", index + 1, len(sample))
+            if record.name in left_out:
+                continue
             if isinstance(found, Glimpse):
                 glimpses.append(found)
             else:
-                damaged.append((chosen[index], found))
+                damaged.append((record, found))
     if damaged:
         left_out |= {record.name for record, _ in damaged}
         findings.warn(

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import cached_property, partial, reduce
@@ -208,10 +209,12 @@ class ReconstructionWork:
     ) -> ReconstructionWork:
         """Check everything, and then make the folders."""
         chosen = options or ReconstructOptions()
-        resolve_device(steps.device)
         for name in (ASSET_NAME, REPORT_NAME):
             require_writable(out / name, is_made=True)
-        frames = plan_frames(capture, chosen.frames, chosen.segment_length)
+        with ThreadPoolExecutor(1) as beside:  # the driver of a GPU starts while images are looked at
+            device = beside.submit(resolve_device, steps.device)
+            frames = plan_frames(capture, chosen.frames, chosen.segment_length)
+            device.result()
         store = FrameStore(out)
         return cls(capture, out, steps, chosen, frames, store.make_folders())
 
