@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,12 +34,17 @@ def for_each_block(work: Callable[[slice], object], row_count: int) -> None:
             work(part)
 
     parts = [slice(start, min(start + BLOCK_ROWS, row_count)) for start in range(0, row_count, BLOCK_ROWS)]
-    threads = min(len(parts), _core_count())
-    if threads < 2:
+    if min(len(parts), _core_count()) < 2:
         deque(map(quietly, parts), maxlen=0)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        deque(pool.map(quietly, parts), maxlen=0)
+    running = [_pool(_core_count()).submit(quietly, part) for part in parts]
+    try:
+        for one in running:
+            one.result()
+    finally:
+        for one in running:
+            one.cancel()
+        wait(running)
 
 
 def replace_rows(function: Callable[[NDArray[Any]], NDArray[Any]], array: NDArray[Any]) -> None:
@@ -48,6 +54,16 @@ def replace_rows(function: Callable[[NDArray[Any]], NDArray[Any]], array: NDArra
         array[part] = function(array[part])
 
     for_each_block(work, len(array))
+
+
+@lru_cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Return threads that stay: to start them for every array takes as long as most arrays do."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="beam-blocks")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def _core_count() -> int:

@@ -10,6 +10,7 @@ sampling of visible normals); Karis 2013 (the split into A and B).
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
@@ -89,8 +90,9 @@ def specular_albedo_table() -> NDArray[np.float32]:
     """
     nodes = np.linspace(0.0, 1.0, TABLE_SIZE)
     cosines = np.maximum(nodes * nodes, 1e-6)
-    rows = [np.stack(specular_albedo_terms(cosines, np.full_like(cosines, r)), axis=-1) for r in nodes]
-    table = np.stack(rows).astype(np.float32)
+    with ThreadPoolExecutor() as pool:
+        rows = pool.map(lambda r: np.stack(specular_albedo_terms(cosines, np.full_like(cosines, r)), axis=-1), nodes)
+        table = np.stack(list(rows)).astype(np.float32)
     table.flags.writeable = False
     return table
 
