@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beam_warp.capture.views import CapturedView
 from beam_warp.decomposition.capture_images import CaptureImages
 from beam_warp.jobs.progress import JobLog
-from beam_warp.materials.base_color import fill_from_neighbors
+from beam_warp.materials.base_color import Neighbors
 from beam_warp.materials.evidence import ViewEvidence, view_evidence
 from beam_warp.materials.light import light_evidence
 from beam_warp.materials.light_fits import LightEvidence
@@ -45,7 +45,7 @@ class SeenFrame:
 
     def forget(self) -> None:
         """Free what was worked out, which lies on the device; it is worked out again when it is asked for."""
-        for name in ("scene", "views", "points", "surface", "light_evidence"):
+        for name in ("scene", "views", "points", "neighbors", "surface", "light_evidence"):
             self.__dict__.pop(name, None)
 
     @cached_property
@@ -59,7 +59,12 @@ class SeenFrame:
         if self.capture is None:
             return []
         with self.log.timer("read images"):
-            return self.capture.views(self.number)
+            return self.__dict__.pop("read", None) or self.capture.views(self.number)
+
+    def read_ahead(self) -> None:
+        """Read the images for whoever asks next, in a thread that touches no device."""
+        if self.capture is not None and "views" not in self.__dict__:
+            self.__dict__["read"] = self.capture.views(self.number)
 
     @cached_property
     def views(self) -> ViewEvidence | None:
@@ -89,6 +94,11 @@ class SeenFrame:
             return SurfacePoints.seen_by(self.cloud, views, scene, offset)
 
     @cached_property
+    def neighbors(self) -> Neighbors:
+        """What views show around Gaussians that none of them does."""
+        return Neighbors.of(self.cloud.positions, ~self.points.seen)
+
+    @cached_property
     def light_evidence(self) -> LightEvidence:
         """What well-seen Gaussians show of the light; only with a capture."""
         assert self.views is not None
@@ -107,7 +117,7 @@ class SeenFrame:
                 )
         points = self.points
         normals = points.normals.numpy()
-        filled, _ = fill_from_neighbors(self.cloud.positions, normals, np.zeros_like(normals), ~points.seen)
+        filled = self.neighbors.fill(normals)
         length = np.linalg.norm(filled, axis=1, keepdims=True)
         upright = np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), filled.shape)
         unit = np.where(length > 1e-6, filled / np.maximum(length, 1e-6), upright).astype(np.float32)
@@ -117,6 +127,6 @@ class SeenFrame:
         self, visibility: NDArray[np.float32], error: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Give Gaussians that no view shows the ambient occlusion of their neighbours, ``(N,)`` each."""
-        missing = ~self.points.seen
-        mean, spread = fill_from_neighbors(self.cloud.positions, visibility[:, None], error[:, None], missing)
+        seen = (visibility[:, None], error[:, None])
+        mean, spread = self.neighbors.fill(seen[0]), self.neighbors.spread(self.cloud.positions, *seen)
         return mean[:, 0].astype(np.float32), spread[:, 0].astype(np.float32)

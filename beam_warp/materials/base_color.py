@@ -6,7 +6,7 @@ Nothing is divided by a small number: what was hardly lit or never seen is flagg
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,36 +185,67 @@ def _has_evidence(evidence: ColorEvidence) -> NDArray[np.bool_]:
     return np.all(np.asarray(evidence.denominator) > 0.0, axis=1)
 
 
+class Neighbors(NamedTuple):
+    """The nearest observed rows of each that was not observed.
+
+    Attributes:
+        missing: Which rows were not observed, ``(N,)``.
+        distance: Ascending, ``(M, K)`` [m]; K is 0 where none was.
+        rows: Numbers of those neighbours, ``(M, K)``.
+        weight: Of their mean, ``(M, K)``.
+    """
+
+    missing: NDArray[np.bool_]
+    distance: NDArray[np.float64]
+    rows: NDArray[np.int64]
+    weight: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, positions: NDArray[np.float32], missing: NDArray[np.bool_]) -> Neighbors:
+        """Look for them, given the centres [m], ``(N, 3)``."""
+        known = np.flatnonzero(~missing)
+        k = min(FILL_NEIGHBORS, len(known)) if missing.any() else 0
+        if k == 0:
+            nothing = np.zeros((np.count_nonzero(missing), 0))
+            return cls(missing, nothing, nothing.astype(np.int64), nothing)
+        distance, index = cKDTree(positions[known]).query(positions[missing], k=k, workers=-1)
+        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+        weight = 1.0 / np.maximum(distance, 1e-9)
+        weight /= weight.sum(axis=1, keepdims=True)
+        return cls(missing, distance, known[index], weight)
+
+    def fill(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Give what was not observed the mean of its neighbours, ``(N, C)``."""
+        if not self.rows.size:
+            return values
+        filled = values.copy()
+        filled[self.missing] = self._mean(values[self.rows])
+        return filled
+
+    def _mean(self, near: NDArray[Any]) -> NDArray[Any]:
+        return np.einsum("nk,nkc->nc", self.weight, near)
+
+    def spread(self, positions: NDArray[np.float32], values: NDArray[Any], errors: NDArray[Any]) -> NDArray[Any]:
+        """Return the errors, ``(N, C)``, with those of what `fill` fills.
+
+        These are the spread of the neighbours, or how much values differ at the distance from them if that is more, and
+        their own error beside it.
+        """
+        if not self.rows.size:
+            return errors
+        near, spread, known = values[self.rows], errors.copy(), ~self.missing
+        around = np.sqrt(np.einsum("nk,nkc->nc", self.weight, (near - self._mean(near)[:, None]) ** 2))
+        away = _difference_at(self.distance[:, 0], positions[known], values[known])
+        spread[self.missing] = np.maximum(around, away) + errors[known].mean(axis=0)
+        return spread
+
+
 def fill_from_neighbors(
     positions: NDArray[np.float32], values: NDArray[Any], errors: NDArray[Any], missing: NDArray[np.bool_]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Give what was not observed the mean of its nearest observed neighbours.
-
-    Its error is their spread, or how much values differ at its distance from them if that is more, and their own error
-    beside it.
-
-    Args:
-        positions: Centres [m], ``(N, 3)``.
-        values: ``(N, C)``.
-        errors: ``(N, C)``.
-        missing: Which rows are to be filled, ``(N,)``.
-    """
-    known = np.flatnonzero(~missing)
-    if not missing.any() or len(known) == 0:
-        return values, errors
-    k = min(FILL_NEIGHBORS, len(known))
-    distance, index = cKDTree(positions[known]).query(positions[missing], k=k, workers=-1)
-    distance, index = distance.reshape(-1, k), index.reshape(-1, k)
-    weight = 1.0 / np.maximum(distance, 1e-9)
-    weight /= weight.sum(axis=1, keepdims=True)
-    near = values[known[index]]
-    mean = np.einsum("nk,nkc->nc", weight, near)
-    filled, spread = values.copy(), errors.copy()
-    filled[missing] = mean
-    around = np.sqrt(np.einsum("nk,nkc->nc", weight, (near - mean[:, None]) ** 2))
-    away = _difference_at(distance[:, 0], positions[known], values[known])
-    spread[missing] = np.maximum(around, away) + errors[known].mean(axis=0)
-    return filled, spread
+    """Return values and errors, ``(N, C)``, what is missing filled from its neighbours; see `Neighbors`."""
+    near = Neighbors.of(positions, missing)
+    return near.fill(values), near.spread(positions, values, errors)
 
 
 def _difference_at(distance: NDArray[Any], positions: NDArray[np.float32], values: NDArray[Any]) -> NDArray[np.float64]:

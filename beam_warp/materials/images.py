@@ -39,7 +39,7 @@ from beam_warp.kernels.materials.base_color_pixels import PixelGuards, ShownPixe
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.bake import BakedValues, BakeOptions, BakeTarget, Solver, bake
 from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
-from beam_warp.materials.base_color import fill_from_neighbors
+from beam_warp.materials.base_color import Neighbors
 from beam_warp.materials.light_rays import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.materials.residues import (
     FEWEST_LIGHT_SAMPLES,
@@ -366,8 +366,7 @@ def _bake(
         filled = np.stack([color, occlusion], axis=1) <= UNSEEN_EVIDENCE
         values = baked.values.copy()
         for columns, missing in ((slice(0, 3), filled[:, 0]), (slice(3, 4), filled[:, 1])):
-            some = values[:, columns]
-            values[:, columns], _ = fill_from_neighbors(cloud.positions, some, np.zeros_like(some), missing)
+            values[:, columns] = Neighbors.of(cloud.positions, missing).fill(values[:, columns])
     return replace(baked, values=values), filled
 
 
