@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,9 @@ from beam_warp.errors import MissingFileError, MissingPackageError
 RACE_SECONDS = 2.0
 """Coarsest time step of usual file systems (FAT)."""
 
+
+PART_BYTES = 2**22
+"""Bytes of a file that are digested at a time."""
 
 SOURCE_SUFFIXES = (".py", ".usda")
 """Files of the package that a result can depend on: code, and the schema."""
@@ -121,12 +125,26 @@ def content_digest(path: Path, known: Mapping[str, list[Any]]) -> tuple[tuple[in
         if remembered is not None and remembered[:-1] == list(stamp):
             return stamp, remembered[-1]
         started = time.time()
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+        digest = _file_digest(path, status.st_size)
     except OSError as error:
         raise MissingFileError(f"input must be readable, got {path} ({error.strerror}). Check the path.") from error
     settled = started - max(status.st_mtime, status.st_ctime) > RACE_SECONDS
     return (stamp if settled else None), digest
+
+
+def _file_digest(path: Path, size: int) -> str:
+    """Return the digest of a file; of a long one, that of the digests of its parts, each taken by a thread."""
+
+    def digest_at(start: int) -> Any:
+        with path.open("rb") as file:
+            file.seek(start)
+            return hashlib.blake2b(file.read(min(PART_BYTES, size)), digest_size=16)
+
+    if size <= PART_BYTES:
+        return digest_at(0).hexdigest()
+    with ThreadPoolExecutor() as pool:
+        parts = pool.map(digest_at, range(0, size, PART_BYTES))
+        return hashlib.blake2b(b"".join(part.digest() for part in parts), digest_size=16).hexdigest()
 
 
 def array_digest(*arrays: NDArray[Any], text: str = "") -> str:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from beam_warp.digests import code_digest, source_digest
+from beam_warp import digests
+from beam_warp.digests import code_digest, content_digest, source_digest
 
 
 def write(folder, files):
@@ -79,3 +80,15 @@ def test_a_checkout_in_the_way_of_the_installed_package_is_named():
     assert said.stderr.splitlines()[-1].startswith(
         "beam_warp.errors.MissingPackageError: beam_warp must be the installed package, got the folder of a checkout"
     )
+
+
+@pytest.mark.parametrize("at", [0, 7, 8, 19])
+def test_any_change_of_a_file_shows_in_whichever_part_it_is(tmp_path, monkeypatch, at):
+    monkeypatch.setattr(digests, "PART_BYTES", 8)
+    path, content = tmp_path / "a", bytearray(range(20))
+    path.write_bytes(content)
+    before = content_digest(path, {})[1]
+    assert content_digest(path, {})[1] == before
+    content[at] ^= 1
+    path.write_bytes(content)
+    assert content_digest(path, {})[1] != before
