@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,6 +17,9 @@ from beam_warp.schema.stage_queries import open_asset, stage_axes, stage_meters
 from beam_warp.schema.writer import WrittenClips, write_asset
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
+
+MOST_KEPT = 2**29
+"""Frames that a writer keeps in memory, at most, and one more [byte]."""
 
 
 def read(path: Path, options: ReadOptions) -> GaussianSequence:
@@ -58,13 +62,28 @@ def write(
     sequence: GaussianSequence, path: Path, options: WriteOptions, clips: WrittenClips | None = None
 ) -> list[Path]:
     """Write an asset, y up and in metres, or complete one whose clips are written."""
+    whole = prepared(sequence, options.sh_degree)
     return write_asset(
-        prepared(sequence, options.sh_degree),
+        dataclasses.replace(whole, read_frame=_kept(whole.read_frame)),
         path,
         full_float=options.full_float,
         lighting_variants=options.lighting_variants,
         clips=clips,
     )
+
+
+def _kept(read: Callable[[int], GaussianCloud]) -> Callable[[int], GaussianCloud]:
+    """Return a reader that keeps some frames: a writer reads each twice, which for short sequences makes once."""
+    kept: dict[int, GaussianCloud] = {}
+
+    def again(frame: int) -> GaussianCloud:
+        if frame not in kept:
+            if sum(array.nbytes for cloud in kept.values() for array in cloud.arrays().values()) > MOST_KEPT:
+                kept.clear()
+            kept[frame] = read(frame)
+        return kept[frame]
+
+    return again
 
 
 def prepared(sequence: GaussianSequence, sh_degree: int | None = None) -> GaussianSequence:

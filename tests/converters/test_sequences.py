@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beam_warp import converters
-from beam_warp.converters import WriteOptions
+from beam_warp.converters import WriteOptions, usd
 from beam_warp.errors import AssetFormatError, InvalidArrayError, InvalidOptionError, MissingFileError, OutputError
 from beam_warp.world.axes import change_axes
 from beam_warp.world.gaussians import GaussianSequence
@@ -133,6 +133,18 @@ def test_usd_gets_y_up_metres_and_the_asked_bands(make_cloud, tmp_path):
     assert np.array_equal(back[0].scales, cloud.scales)  # in full float
     assert back.metadata["producer"] == "somebody"
     assert "notes" not in back.metadata
+
+
+@pytest.mark.parametrize(("most_kept", "times"), [(2**29, 1), (0, 2)])
+def test_usd_reads_a_short_sequence_once_to_the_same_bytes(make_cloud, tmp_path, monkeypatch, most_kept, times):
+    clouds, read = [make_cloud(8, seed=frame) for frame in range(3)], list[int]()
+    sequence = GaussianSequence(3, lambda frame: read.append(frame) or clouds[frame])
+    converters.write(sequence, tmp_path / "whole.usdc")
+    read.clear()
+    monkeypatch.setattr(usd, "MOST_KEPT", most_kept)
+    converters.write(sequence, tmp_path / "again.usdc")
+    assert read.count(1) == times
+    assert (tmp_path / "again.usdc").read_bytes() == (tmp_path / "whole.usdc").read_bytes()
 
 
 def test_what_the_caller_states_outranks_a_stage_with_a_note(make_cloud, tmp_path, trusted_files):
