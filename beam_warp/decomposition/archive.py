@@ -68,6 +68,11 @@ class FrameArchive:
             report=arrays["report"],
         )
 
+    def evidence(self, number: int) -> ColorEvidence:
+        """Return the evidence of a frame that was kept: a quarter of it."""
+        arrays = read_frame(self.frame_path(number), tuple(EVIDENCE + name for name in ColorEvidence.ARRAYS))
+        return ColorEvidence.from_arrays({name.removeprefix(EVIDENCE): array for name, array in arrays.items()})
+
     def keep(self, frame: MeasuredFrame) -> None:
         """Store a frame.
 

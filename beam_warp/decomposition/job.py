@@ -15,9 +15,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from beam_warp.capture.capture import Capture
@@ -39,6 +42,9 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
 OVERVIEW_NAME = "overview.png"
+
+LATE = ("trimesh", "scipy.interpolate", "beam_warp.converters.usd")
+"""Modules that a take can start without, but that take long to import: of previews, of roughness, of the asset."""
 
 COUNTED = {"materials": "decompose"}
 """Stages that a listener hears of when a step is done, and what they are called."""
@@ -166,11 +172,23 @@ def run_capture(
     """
     with closing(frames):
         notes = _prepare(work)
+        _import_ahead()
         plan = work.plan().with_steps_of(frames.plan())
         watch = Counted(plan, {"frame": "frames", **COUNTED}, work.progress)
         receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
         found = frames.finish(receipts, started, work.progress)
         return TakeResult(found, _finish(work, receipts, notes, overview or OverviewOptions(), started))
+
+
+def _import_ahead() -> None:
+    """Import what later steps and the end need, while the first ones wait for the device."""
+
+    def load() -> None:
+        with suppress(ImportError):  # whoever needs it says so
+            for name in LATE:
+                import_module(name)
+
+    Thread(target=load).start()
 
 
 def _prepare(work: MaterialWork) -> list[str]:
@@ -195,12 +213,18 @@ def _finish(
     persistent = work.are_persistent
     relightable = relightable_sequence(plan, work.solved, made.statistics, persistent=persistent)
     with staged_folder(out / "results") as staged:  # all of them appear, or none
-        with log.timer("write asset"):
-            layers = work.clips.write(relightable, staged / ASSET_NAME, receipts)
-        with log.timer("overview"):
-            work.progress("overview", 0, 1)
-            draw_overview(staged / OVERVIEW_NAME, relightable, plan, overview)
-            work.progress("overview", 1, 1)
+
+        def draw() -> None:
+            with log.timer("overview"):
+                draw_overview(staged / OVERVIEW_NAME, relightable, plan, overview)
+
+        work.progress("overview", 0, 1)
+        with ThreadPoolExecutor(1) as beside:
+            drawn = beside.submit(draw)
+            with log.timer("write asset"):
+                layers = work.clips.write(relightable, staged / ASSET_NAME, receipts)
+            drawn.result()
+        work.progress("overview", 1, 1)
         seconds = time.perf_counter() - started
         report = run_report(plan, made, findings=work.findings(), persistent=persistent, seconds=seconds)
         report["input"]["notes"] += notes

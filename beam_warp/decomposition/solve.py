@@ -65,9 +65,9 @@ class JointColor:
         """Whether frames disagree on any."""
         return bool(self.change.changing.any())
 
-    def of_frame(self, frame: MeasuredFrame) -> BaseColor:
-        """Return the base colour of a frame."""
-        return with_changes(self.constant, self.change, _evidence(frame))
+    def of_frame(self, evidence: ColorEvidence) -> BaseColor:
+        """Return the base colour of a frame, given its evidence."""
+        return with_changes(self.constant, self.change, evidence)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all of it as arrays to be stored."""
@@ -83,7 +83,9 @@ class JointColor:
         return cls(BaseColor(**constant), ColorChange(**change))
 
 
-def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> tuple[JointColor, dict[str, Any]]:
+def solve_jointly(
+    plan: JobPlan, first: MeasuredFrame, others: Iterable[ColorEvidence]
+) -> tuple[JointColor, dict[str, Any]]:
     """Solve one base colour for all frames, and find the Gaussians on which frames disagree.
 
     The solution of the first frame is stored; without such Gaussians it is that of all. Memory does not grow with the
@@ -92,20 +94,17 @@ def solve_jointly(plan: JobPlan, frames: Iterable[MeasuredFrame]) -> tuple[Joint
     Returns:
         The colour, and facts: what `counts_of` says of the first frame, and `changes_of` of all.
     """
-    first, joint, test = None, None, ChangeTest()
-    for frame in frames:
+    joint, test = _evidence(first), ChangeTest()
+    test.add(joint)
+    for evidence in others:
         with plan.source.log.timer("solve"):
-            evidence = _evidence(frame)
-            first = first or frame
-            joint = evidence if joint is None else joint + evidence
+            joint += evidence
             test.add(evidence)
-    assert first is not None
-    assert joint is not None
     with plan.source.log.timer("solve"):
         change = test.result()
         constant = _solve(plan, first, joint, dispersion=change.dispersion)
         color = JointColor(constant, change)
-        solved = color.of_frame(first)
+        solved = color.of_frame(_evidence(first))
         plan.archive.keep_solution(first.number, solved)
         shown = first.cloud.with_arrays(**solved.arrays())
     return color, {"counts": [counts_of(first, shown, constant.clipped_part)], "changes": changes_of(change)}

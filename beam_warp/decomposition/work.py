@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -327,9 +328,24 @@ class MaterialWork:
             write_frame(self.stored("roughness"), {})
             return {}
         asked = asked_frames(len(self.source.sequence))
-        estimate = find_roughness(self.job, map(self._frame, asked))
+        estimate = find_roughness(self.job, self._frames(asked))
         write_frame(self.stored("roughness"), _roughness_arrays(estimate))
         return {"roughness": estimate.report}
+
+    def _frames(self, indices: Sequence[int]) -> Iterator[SeenFrame]:
+        """Yield frames; while one is worked on, the next one and its images are read."""
+
+        def read(index: int) -> SeenFrame:
+            frame = self._frame(index)
+            frame.read_ahead()
+            return frame
+
+        with ThreadPoolExecutor(1) as reader:
+            ahead = reader.submit(read, indices[0])
+            for index in indices[1:]:
+                frame, ahead = ahead.result(), reader.submit(read, index)
+                yield frame
+            yield ahead.result()
 
     def _measure(self, index: int) -> dict[str, Any]:
         """Measure a frame and store it."""
@@ -350,7 +366,8 @@ class MaterialWork:
         """Solve base colour over all frames; nothing where tracking was lost, so that they are not persistent."""
         found, facts = None, {}
         if self.are_persistent:
-            found, facts = solve_jointly(self.job, map(self.archive.read, range(len(self.frames.numbers()))))
+            others = map(self.archive.evidence, range(1, len(self.frames.numbers())))
+            found, facts = solve_jointly(self.job, self.archive.read(0), others)
         write_frame(self.stored("joint"), {} if found is None else found.arrays())
         return facts
 
@@ -365,12 +382,12 @@ class MaterialWork:
         """Write the solutions of some frames."""
         counts = []
         for place in places:
-            frame = self.archive.read(place)
             if self._joint is None:
-                counts.append(solve_frame(self.job, frame))
+                counts.append(solve_frame(self.job, self.archive.read(place)))
             else:
+                evidence = self.archive.evidence(place)
                 with self.source.log.timer("solve"):
-                    self.archive.keep_solution(place, self._joint.of_frame(frame))
+                    self.archive.keep_solution(place, self._joint.of_frame(evidence))
         return {"counts": counts}
 
     def _roughness(self, frame: SeenFrame, facts: dict[str, Any]) -> Mapping[str, NDArray[np.float32]]:
