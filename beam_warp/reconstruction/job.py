@@ -202,6 +202,7 @@ class ReconstructionWork:
     notes: list[str]
     _reader: FrameReader | None = None
     _latest: tuple[int, Sequence[CapturedView]] | None = None
+    _mended: tuple[str, Sequence[CapturedView]] | None = None
 
     @classmethod
     def prepare(
@@ -337,8 +338,8 @@ class ReconstructionWork:
             self._latest = None
             return {}
         self._latest = None
-        views = self._images().views(step.frame)
-        self._latest = step.frame, views
+        views = self._views(self._images(), step.frame)
+        self._latest, self._mended = (step.frame, views), None
         for following in task.following:
             if following.stage in ("frame", "seam") and following.frame is not None:
                 self._images().expect(following.frame)
@@ -347,19 +348,26 @@ class ReconstructionWork:
 
     def close(self) -> None:
         """End the threads that read."""
-        self._latest = None
+        self._latest = self._mended = None
         if self._reader is not None:
             self._reader.__exit__()
             self._reader = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what other processes need: no threads, no images, nothing that was read."""
-        return {**{field.name: vars(self)[field.name] for field in fields(self)}, "_reader": None, "_latest": None}
+        kept = {field.name: vars(self)[field.name] for field in fields(self)}
+        return {**kept, "_reader": None, "_latest": None, "_mended": None}
 
     def _images(self) -> FrameReader:
         if self._reader is None:
             self._reader = FrameReader(self.records, self.store.digests)
         return self._reader
+
+    def _views(self, reader: FrameReader, frame: int) -> Sequence[CapturedView]:
+        """Return the images of a frame; where the step before found nothing in them to put right, those that it saw."""
+        if self._mended is not None and self._mended[0] == reader.digest(frame):
+            return self._mended[1]
+        return reader.views(frame)
 
     def _mend(self, stage: str, progress: NotedProgress) -> dict[str, Any]:
         """Find something wrong with the capture, what was found before it put right."""
@@ -369,7 +377,8 @@ class ReconstructionWork:
         records = _corrected({frame: self.frames.records[frame]}, known)
         with FrameReader(records, self.store.digests) as reader:
             names = [record.camera_name for record in records[frame]]
-            found = mend.find(self.steps, names, reader.views(frame), within(progress, stage, frame))
+            self._mended = reader.digest(frame), self._views(reader, frame)
+            found = mend.find(self.steps, names, self._mended[1], within(progress, stage, frame))
         if found is None:
             (self.folder / mend.kind.FILE).unlink(missing_ok=True)
         else:

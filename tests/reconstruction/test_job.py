@@ -222,8 +222,8 @@ class TestOutputs:
 
         monkeypatch.setattr(CaptureRecord, "view", counted)
         reconstruct(capture, tmp_path / "out", FakeSteps())
-        # Once to inspect the capture, once for fit, tracking and previews, and the first frame for each mend.
-        assert len(most) == 2 * 3 * len(FRAMES) + 3 * 3
+        # Once to inspect the capture, and once for mends, fit, tracking and previews.
+        assert len(most) == 2 * 3 * len(FRAMES)
         gc.collect()
         assert max(most) <= 2 * 3
         assert not alive
