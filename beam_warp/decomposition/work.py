@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
@@ -47,6 +48,9 @@ from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 ASSET_STEM = Path(ASSET_NAME).stem
 
 STAGES = ("light", "roughness", "materials", "joint", "solution")
+
+SOLVED_AT_A_TIME = 4
+"""Frames whose solutions are made by a thread each."""
 
 PART = 30
 """Frames of persistent Gaussians whose solutions a step writes: they take a moment each."""
@@ -380,15 +384,16 @@ class MaterialWork:
 
     def _solve(self, places: Iterable[int]) -> dict[str, Any]:
         """Write the solutions of some frames."""
-        counts = []
-        for place in places:
-            if self._joint is None:
-                counts.append(solve_frame(self.job, self.archive.read(place)))
-            else:
-                evidence = self.archive.evidence(place)
-                with self.source.log.timer("solve"):
-                    self.archive.keep_solution(place, self._joint.of_frame(evidence))
-        return {"counts": counts}
+        joint = self._joint
+        if joint is None:
+            return {"counts": [solve_frame(self.job, self.archive.read(place)) for place in places]}
+
+        def solve(place: int) -> None:
+            self.archive.keep_solution(place, joint.of_frame(self.archive.evidence(place)))
+
+        with self.source.log.timer("solve"), ThreadPoolExecutor(SOLVED_AT_A_TIME) as pool:
+            deque(pool.map(solve, places), maxlen=0)
+        return {"counts": []}
 
     def _roughness(self, frame: SeenFrame, facts: dict[str, Any]) -> Mapping[str, NDArray[np.float32]]:
         """Return the roughness of a frame: stated, what all frames share, or its own, whose report joins the facts."""
