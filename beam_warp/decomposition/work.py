@@ -27,7 +27,7 @@ from beam_warp.decomposition.options import ESTIMATE, RunOptions
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.roughness_finder import asked_frames, find_roughness
 from beam_warp.decomposition.seen import SeenFrame
-from beam_warp.decomposition.solve import JointColor, SolvedFrames, solve_frame, solve_jointly
+from beam_warp.decomposition.solve import AT_A_TIME, JointColor, SolvedFrames, solve_frame, solve_jointly
 from beam_warp.decomposition.source import Source
 from beam_warp.decomposition.tally import counts_of
 from beam_warp.device.arrays import resolve_device
@@ -48,9 +48,6 @@ from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 ASSET_STEM = Path(ASSET_NAME).stem
 
 STAGES = ("light", "roughness", "materials", "joint", "solution")
-
-SOLVED_AT_A_TIME = 4
-"""Frames whose solutions are made by a thread each."""
 
 PART = 30
 """Frames of persistent Gaussians whose solutions a step writes: they take a moment each."""
@@ -370,8 +367,8 @@ class MaterialWork:
         """Solve base colour over all frames; nothing where tracking was lost, so that they are not persistent."""
         found, facts = None, {}
         if self.are_persistent:
-            others = map(self.archive.evidence, range(1, len(self.frames.numbers())))
-            found, facts = solve_jointly(self.job, self.archive.read(0), others)
+            others = range(1, len(self.frames.numbers()))
+            found, facts = solve_jointly(self.job, self.archive.read(0), self.archive.evidence, others)
         write_frame(self.stored("joint"), {} if found is None else found.arrays())
         return facts
 
@@ -391,7 +388,7 @@ class MaterialWork:
         def solve(place: int) -> None:
             self.archive.keep_solution(place, joint.of_frame(self.archive.evidence(place)))
 
-        with self.source.log.timer("solve"), ThreadPoolExecutor(SOLVED_AT_A_TIME) as pool:
+        with self.source.log.timer("solve"), ThreadPoolExecutor(AT_A_TIME) as pool:
             deque(pool.map(solve, places), maxlen=0)
         return {"counts": []}
 
