@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -16,6 +17,9 @@ from beam_warp.materials.base_color import BaseColor, solve_base_color
 from beam_warp.materials.changes import ChangeTest, ColorChange, with_changes
 from beam_warp.materials.direct import ColorEvidence
 from beam_warp.world.gaussians import GaussianCloud
+
+AT_A_TIME = 4
+"""Frames whose evidence is looked at by a thread each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +88,34 @@ class JointColor:
 
 
 def solve_jointly(
-    plan: JobPlan, first: MeasuredFrame, others: Iterable[ColorEvidence]
+    plan: JobPlan, first: MeasuredFrame, read: Callable[[int], ColorEvidence], others: Sequence[int]
 ) -> tuple[JointColor, dict[str, Any]]:
     """Solve one base colour for all frames, and find the Gaussians on which frames disagree.
 
     The solution of the first frame is stored; without such Gaussians it is that of all. Memory does not grow with the
     number of frames.
 
+    Args:
+        plan: The job.
+        first: The first frame.
+        read: Returns the evidence of a frame, by its number; called by threads.
+        others: Numbers of the other frames.
+
     Returns:
         The colour, and facts: what `counts_of` says of the first frame, and `changes_of` of all.
     """
-    joint, test = _evidence(first), ChangeTest()
-    test.add(joint)
-    for evidence in others:
-        with plan.source.log.timer("solve"):
-            joint += evidence
-            test.add(evidence)
-    with plan.source.log.timer("solve"):
+
+    def look(number: int) -> tuple[ColorEvidence, NDArray[np.float64]]:
+        evidence = read(number)
+        return evidence, ChangeTest.terms(evidence)
+
+    with plan.source.log.timer("solve"), ThreadPoolExecutor(AT_A_TIME) as pool:
+        joint, test = _evidence(first), ChangeTest()
+        test.add(joint)
+        for start in range(0, len(others), AT_A_TIME):
+            for evidence, terms in pool.map(look, others[start : start + AT_A_TIME]):
+                joint += evidence
+                test.add_terms(terms)
         change = test.result()
         constant = _solve(plan, first, joint, dispersion=change.dispersion)
         color = JointColor(constant, change)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
@@ -26,7 +27,7 @@ from beam_warp.decomposition.options import ESTIMATE, RunOptions
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.roughness_finder import asked_frames, find_roughness
 from beam_warp.decomposition.seen import SeenFrame
-from beam_warp.decomposition.solve import JointColor, SolvedFrames, solve_frame, solve_jointly
+from beam_warp.decomposition.solve import AT_A_TIME, JointColor, SolvedFrames, solve_frame, solve_jointly
 from beam_warp.decomposition.source import Source
 from beam_warp.decomposition.tally import counts_of
 from beam_warp.device.arrays import resolve_device
@@ -366,8 +367,8 @@ class MaterialWork:
         """Solve base colour over all frames; nothing where tracking was lost, so that they are not persistent."""
         found, facts = None, {}
         if self.are_persistent:
-            others = map(self.archive.evidence, range(1, len(self.frames.numbers())))
-            found, facts = solve_jointly(self.job, self.archive.read(0), others)
+            others = range(1, len(self.frames.numbers()))
+            found, facts = solve_jointly(self.job, self.archive.read(0), self.archive.evidence, others)
         write_frame(self.stored("joint"), {} if found is None else found.arrays())
         return facts
 
@@ -380,15 +381,16 @@ class MaterialWork:
 
     def _solve(self, places: Iterable[int]) -> dict[str, Any]:
         """Write the solutions of some frames."""
-        counts = []
-        for place in places:
-            if self._joint is None:
-                counts.append(solve_frame(self.job, self.archive.read(place)))
-            else:
-                evidence = self.archive.evidence(place)
-                with self.source.log.timer("solve"):
-                    self.archive.keep_solution(place, self._joint.of_frame(evidence))
-        return {"counts": counts}
+        joint = self._joint
+        if joint is None:
+            return {"counts": [solve_frame(self.job, self.archive.read(place)) for place in places]}
+
+        def solve(place: int) -> None:
+            self.archive.keep_solution(place, joint.of_frame(self.archive.evidence(place)))
+
+        with self.source.log.timer("solve"), ThreadPoolExecutor(AT_A_TIME) as pool:
+            deque(pool.map(solve, places), maxlen=0)
+        return {"counts": []}
 
     def _roughness(self, frame: SeenFrame, facts: dict[str, Any]) -> Mapping[str, NDArray[np.float32]]:
         """Return the roughness of a frame: stated, what all frames share, or its own, whose report joins the facts."""

@@ -67,9 +67,18 @@ class ChangeTest:
 
     def add(self, evidence: ColorEvidence) -> None:
         """Count the evidence of one frame."""
+        self.add_terms(self.terms(evidence))
+
+    @staticmethod
+    def terms(evidence: ColorEvidence) -> NDArray[np.float64]:
+        """Return what `add_terms` adds for the evidence of one frame, ``(4, N, 3)``; threads may work it out."""
         color, variance, known = _frame(evidence)
         weight = np.where(known, 1.0 / variance, 0.0)
-        self._sums = self._sums + np.stack([known, weight, weight * color, weight * color**2])
+        return np.stack([known, weight, weight * color, weight * color**2])
+
+    def add_terms(self, terms: NDArray[np.float64]) -> None:
+        """Count one frame, given its terms."""
+        self._sums = self._sums + terms
 
     def result(self) -> ColorChange:
         """Test every Gaussian; false discoveries are bounded over all of them (Benjamini and Hochberg 1995)."""
