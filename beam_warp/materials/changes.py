@@ -74,7 +74,7 @@ class ChangeTest:
         """Return what `add_terms` adds for the evidence of one frame, ``(4, N, 3)``; threads may work it out."""
         color, variance, known = _frame(evidence)
         weight = np.where(known, 1.0 / variance, 0.0)
-        return np.stack([known, weight, weight * color, weight * color**2])
+        return np.stack([known.astype(np.float64), weight, weight * color, weight * color**2])
 
     def add_terms(self, terms: NDArray[np.float64]) -> None:
         """Count one frame, given its terms."""
