@@ -81,13 +81,13 @@ def find_roughness(plan: JobPlan, frames: Iterable[SeenFrame], count: int) -> Ro
         total, used = profile if total is None else total + profile, used + 1
         if used == count:
             change = 0.0
-            break
-        found = solve_roughness(positions[asked], total.of(asked))
-        if told is not None:
-            change = _change_by_more(told, found, used, count)
-            if change <= PART * _size(found.standard_error):
-                break
-        told = found
+        elif count > 2:  # one change must be known before a frame is left out
+            found = solve_roughness(positions[asked], total.of(asked))
+            if told is not None:
+                change = _change_by_more(told, found, used, count)
+                if change <= PART * _size(found.standard_error):
+                    break
+            told = found
     estimate = solve_roughness(positions, total or RoughnessProfile.of_nothing(len(positions)))
     left_out = {"frames_left_out": count - used, "left_out_change": change}
     return replace(estimate, report={**estimate.report, **left_out})
