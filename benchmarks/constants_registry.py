@@ -253,6 +253,7 @@ MATERIALS = (
     Constant(ROUGH + "ROUGHNESS_FRAMES", WALKER, "Most frames that roughness is found from.", ONE_FRAME),
     Constant(ROUGH + "PART", JUDGED, "Part of its error by which left-out frames may change roughness.", ONE_FRAME),
     Constant(ROUGH + "PILOT_GAUSSIANS", JUDGED, "Gaussians that tell whether views say anything of roughness."),
+    Constant(ROUGH + "TOLD_GAUSSIANS", WALKER, "Gaussians that tell whether more frames would change it.", ONE_FRAME),
     Constant(ROUGH + "LEAST_SAVED", JUDGED, "How many times as many Gaussians a frame has for a pilot."),
     Constant("beam_warp.materials.direct:BURIED_VISIBILITY", JUDGED, "Visibility below which light is not traced."),
     Constant("beam_warp.materials.normals:LAYER_REACH", JUDGED, "How far from the surface a Gaussian is of a layer."),

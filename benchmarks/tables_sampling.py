@@ -124,7 +124,7 @@ def economy_frames(result: Row) -> Rows:
     return rows
 
 
-@table("economy_views", "economy_frames_cpu.json")
+@table("economy_views", "economy_views_cpu.json")
 def economy_views(result: Row) -> Rows:
     """Base colour and occlusion by all training views and by parts of them."""
     rows: list[list[Any]] = [["", "base colour", "occlusion", "changed", "by more than its error", "s (views)"]]
