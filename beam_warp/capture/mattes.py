@@ -17,6 +17,7 @@ give the subject's part: I - (1 - a) B before a smooth backdrop, a F before a cl
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,8 +89,8 @@ SPECK = 24
 KEY_BLUR = 0.5
 """Standard deviation that gives the outline of keyed pixels the softness of a pixel's area [pixel]."""
 
-BLURRED = 0.3
-"""A backdrop is known if its standard error is less than this part of the contrast."""
+BACKDROP_ERROR = 0.3
+"""Standard error, as a part of the contrast, from which on a backdrop's colour is not known."""
 
 SURE = 3.0
 """What is less than this many standard errors from 0 counts as 0."""
@@ -113,6 +114,24 @@ class MaskOffset:
 
 
 @dataclass(frozen=True, eq=False)
+class Uncut:
+    """A photograph before its subject is cut out, and what is behind the subject.
+
+    Attributes:
+        scene: Scene-linear Rec.709 of subject and backdrop, ``(H, W, 3)`` float32; of the subject alone where the
+            backdrop is not known.
+        behind: The backdrop alone, ``(H, W, 3)`` float32; 0 where it is not known.
+    """
+
+    scene: NDArray[np.float32]
+    behind: NDArray[np.float32]
+
+    def mapped(self, of: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Uncut:
+        """Return both images after the same operation."""
+        return Uncut(of(self.scene), of(self.behind))
+
+
+@dataclass(frozen=True, eq=False)
 class Matte:
     """A subject without its backdrop.
 
@@ -121,16 +140,15 @@ class Matte:
         alpha: Coverage in [0, 1], ``(H, W)`` float32.
         offset: How far the given mask reaches beyond the subject; None where the photograph does not tell.
         doubt: How much is not known of a pixel, 0 to 1, ``(H, W)`` float32: coverage and colour are a guess there.
-        scene: The photograph; where the backdrop is not known, the subject alone, ``(H, W, 3)`` float32.
-        behind: The backdrop alone, 0 where it is not known or the mask stays as it is, ``(H, W, 3)`` float32.
+        uncut: The photograph before the subject was cut out of it; None if the mask stays as it is, or nothing is known
+            of the backdrop.
     """
 
     color: NDArray[np.float32]
     alpha: NDArray[np.float32]
     offset: MaskOffset | None
     doubt: NDArray[np.float32]
-    scene: NDArray[np.float32]
-    behind: NDArray[np.float32]
+    uncut: Uncut | None = None
 
 
 def matte(
@@ -148,8 +166,7 @@ def matte(
     """
     outline = _outline(mask)
     if outline is None:
-        color = photograph * mask[..., None]
-        return Matte(color, mask, None, np.zeros_like(mask), color, np.zeros_like(color))
+        return Matte(photograph * mask[..., None], mask, None, np.zeros_like(mask))
     at = tuple(outline.near.T)
     empty = np.float32(0.0) if plate is None else plate
     seen = np.clip(photograph, -BRIGHTEST, BRIGHTEST)
@@ -170,13 +187,15 @@ def matte(
     alpha = (0.5 * (whole + parts)).astype(np.float32)
     color = photograph * alpha[..., None]
     color[at] = _subject(seen[at], alpha[at], inner, outer, outline.nearest)
-    scene, behind = color.copy(), np.zeros_like(color)
-    contrast = np.square(inner.values - outer.values).sum(axis=1)
+    uncut = None
     if common != 0.0 or own.any():  # a mask that is right says more than colours do
-        sure = 3.0 * outer.variances[outline.nearest] < BLURRED**2 * contrast
+        contrast = np.square(inner.values - outer.values).sum(axis=1)
+        sure = 3.0 * outer.variances[outline.nearest] < BACKDROP_ERROR**2 * contrast
         known = tuple(outline.near[sure].T)
+        scene, behind = color.copy(), np.zeros_like(color)
         scene[known], behind[known] = seen[known], np.maximum(outer.values[sure], 0.0)
-    return Matte(color, alpha, offset, np.abs(whole - parts), scene, behind)
+        uncut = Uncut(scene, behind) if sure.any() else None
+    return Matte(color, alpha, offset, np.abs(whole - parts), uncut)
 
 
 def moved_mask(mask: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:

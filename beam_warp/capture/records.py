@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from beam_warp.capture.cutouts import taken_in
 from beam_warp.capture.lenses import Lens
-from beam_warp.capture.mattes import MaskOffset, keyed, matte
+from beam_warp.capture.mattes import MaskOffset, Uncut, keyed, matte
 from beam_warp.capture.undistort import COLORS, Intrinsics, Undistortion
-from beam_warp.capture.views import Backdrop, CapturedView
+from beam_warp.capture.views import CapturedView
 from beam_warp.errors import AssetFormatError, BeamError, MissingFileError
 from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.image.files import SUFFIXES, Image, read_image
@@ -140,12 +140,12 @@ class CaptureRecord:
             MissingFileError: The image, or the mask or plate that the capture names, does not exist.
             AssetFormatError: A file is damaged, not of the camera's size, or holds values that no image has.
         """
-        image, offset, backdrop = self.photograph(), None, None
+        image, offset, uncut = self.photograph(), None, None
         mask = None if self.mask_path is None else _coverage(self._sized(self._read(self.mask_path), "mask"))
         if (scene := _scene(image)) is not None:
             if image.alpha is not None and not _is_opaque(image.alpha):
                 mask = image.alpha if mask is None else image.alpha * mask
-            image, offset, backdrop = self._cut_out(image, scene, mask)
+            image, offset, uncut = self._cut_out(image, scene, mask)
         elif mask is not None:
             image = _masked(image, mask)
         image = self._undistorted(image)
@@ -170,7 +170,7 @@ class CaptureRecord:
             alpha=alpha,
             doubt=doubt if doubt is not None and doubt.any() else None,
             mask_offset=offset,
-            backdrop=backdrop,
+            uncut=uncut,
         )
         if self.gains != (1.0, 1.0, 1.0):
             found = found.brightened(1.0 / np.array(self.gains))
@@ -223,7 +223,7 @@ class CaptureRecord:
 
     def _cut_out(
         self, image: Image, scene: NDArray[np.float32], mask: NDArray[np.float32] | None
-    ) -> tuple[Image, MaskOffset | None, Backdrop | None]:
+    ) -> tuple[Image, MaskOffset | None, Uncut | None]:
         """Return a photograph with the subject's coverage and colour alone, how far off its mask was, and all of it."""
         plate = self._plate()
         if mask is None and plate is None:
@@ -239,8 +239,8 @@ class CaptureRecord:
             planes = dict(zip("RGB", np.moveaxis(rgb, -1, 0), strict=True))
             return self._undistorted(Image(image.path, planes, LINEAR_REC709, premultiplied=False)).linear_rgb()
 
-        backdrop = Backdrop(found.scene, found.behind).mapped(undistorted) if found.behind.any() else None
-        return cut, None if mask is None else found.offset, backdrop
+        uncut = None if found.uncut is None else found.uncut.mapped(undistorted)
+        return cut, None if mask is None else found.offset, uncut
 
     def _sized(self, image: Image, what: str) -> Image:
         if (image.width, image.height) != (self.camera.width, self.camera.height):

@@ -9,29 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beam_warp.capture.mattes import MaskOffset
+from beam_warp.capture.mattes import MaskOffset, Uncut
 from beam_warp.checks import require_array, require_count, require_finite, require_range
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.metrics import block_means
 from beam_warp.world.camera import Camera
-
-
-@dataclass(frozen=True, eq=False)
-class Backdrop:
-    """A photograph whose subject is not cut out, and what is behind the subject.
-
-    Attributes:
-        scene: Scene-linear Rec.709 of subject and backdrop, ``(H, W, 3)`` float32; of the subject alone where the
-            backdrop is not known.
-        behind: The backdrop alone, ``(H, W, 3)`` float32; 0 where it is not known.
-    """
-
-    scene: NDArray[np.float32]
-    behind: NDArray[np.float32]
-
-    def mapped(self, of: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Backdrop:
-        """Return both images after the same operation."""
-        return Backdrop(of(self.scene), of(self.behind))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,7 +28,7 @@ class CapturedView:
         doubt: How much is not known of a pixel, 0 to 1: its colour and coverage are a guess where a photograph does not
             tell where the subject ends, ``(H, W)`` float32; None for nothing of any.
         mask_offset: How far the file's mask reached beyond the subject before it was moved; None if nothing tells.
-        backdrop: The photograph as it was before the subject was cut out of it; None if it shows the subject alone.
+        uncut: The photograph as it was before the subject was cut out of it; None if it shows the subject alone.
 
     Raises:
         InvalidArrayError: An array has another size than the camera, or a value is not finite or out of range.
@@ -58,7 +40,7 @@ class CapturedView:
     alpha: NDArray[np.float32] | None = None
     doubt: NDArray[np.float32] | None = None
     mask_offset: MaskOffset | None = None
-    backdrop: Backdrop | None = None
+    uncut: Uncut | None = None
 
     def __post_init__(self) -> None:
         """Check sizes and values once."""
@@ -112,14 +94,14 @@ class CapturedView:
             color=of(self.color),
             alpha=None if self.alpha is None else of(self.alpha),
             doubt=None if self.doubt is None else of(self.doubt),
-            backdrop=None if self.backdrop is None else self.backdrop.mapped(of),
+            uncut=None if self.uncut is None else self.uncut.mapped(of),
         )
 
     def brightened(self, factors: ArrayLike) -> CapturedView:
         """Return the view with its light times a factor, or one for each of red, green and blue."""
         gains = np.asarray(factors, np.float32)
-        backdrop = None if self.backdrop is None else self.backdrop.mapped(lambda image: image * gains)
-        return replace(self, color=self.color * gains, backdrop=backdrop)
+        uncut = None if self.uncut is None else self.uncut.mapped(lambda image: image * gains)
+        return replace(self, color=self.color * gains, uncut=uncut)
 
     def reduced(self, factor: int) -> CapturedView:
         """Return the view at a lower resolution, each pixel the mean of ``factor`` x ``factor`` pixels.

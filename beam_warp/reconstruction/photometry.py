@@ -151,14 +151,15 @@ def find_exposures(
     normals = _smoothed(cloud.positions, normals)
     samples = view_samples(views, cloud, normals, device=device).numpy()
     rows = np.flatnonzero(((samples[..., 3] > 0.0).sum(axis=0) >= LEAST_VIEWS) & normals.any(axis=1))
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 2 * MOST_POINTS)).astype(int)]
-    positions = cloud.positions[rows].astype(np.float64)
-    away = np.stack([view.camera.position for view in views])[:, None] - positions
-    away /= np.linalg.norm(away, axis=2, keepdims=True)
-    gloss = highlights(normals[rows].astype(np.float64), away, environment, device)
-    solved = solve_gains(samples[:, rows], gloss, FIRST_POINTS)
-    if solved is not None and solved.may_be_wrong():
-        solved = solve_gains(samples[:, rows], gloss, MOST_POINTS)
+    solved = None
+    for most in (FIRST_POINTS, MOST_POINTS):
+        chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), 2 * most)).astype(int)]
+        away = np.stack([view.camera.position for view in views])[:, None] - cloud.positions[chosen].astype(np.float64)
+        away /= np.linalg.norm(away, axis=2, keepdims=True)
+        gloss = highlights(normals[chosen].astype(np.float64), away, environment, device)
+        solved = solve_gains(samples[:, chosen], gloss, most)
+        if solved is None or not solved.may_be_wrong():
+            break
     return None if solved is None else judged(names, solved)
 
 

@@ -159,11 +159,9 @@ class ViewTargets:
         self.height, self.width = views[0].camera.height, views[0].camera.width
         self.samples = samples
         self._cameras: list[PreparedCameras] = [self.rasterizer.prepare_cameras([camera]) for camera in cameras]
-        self._colors = [
-            _encoded(view.color if view.backdrop is None else view.backdrop.scene, self.device) for view in views
-        ]
+        self._colors = [_encoded(view.color if view.uncut is None else view.uncut.scene, self.device) for view in views]
         self._backdrops = [
-            None if view.backdrop is None else upload(view.backdrop.behind, float, self.device) for view in views
+            None if view.uncut is None else upload(view.uncut.behind, float, self.device) for view in views
         ]
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views

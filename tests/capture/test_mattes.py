@@ -27,7 +27,7 @@ def test_a_mask_is_moved_to_the_outline_of_a_disc(pixels, with_plate):
     else:
         np.testing.assert_array_equal(found.alpha, true)
         np.testing.assert_allclose(found.color, true[..., None] * SUBJECT, atol=1e-5)
-        assert not found.behind.any()
+        assert found.uncut is None
 
 
 @pytest.mark.parametrize("pixels", [-1.0, 1.0])
@@ -36,11 +36,12 @@ def test_a_photograph_is_the_subject_before_its_backdrop(pixels):
     true = disc()
     photograph = before(WALL, true)
     found = matte(photograph, disc(RADIUS + pixels))
-    known = found.behind.any(axis=-1)
+    behind, scene = found.uncut.behind, found.uncut.scene
+    known = behind.any(axis=-1)
     assert known[(true > 0.0) & (true < 1.0)].all()
-    np.testing.assert_allclose(found.behind[known], WALL[known], rtol=0.02)
-    np.testing.assert_array_equal(found.scene[known], photograph[known])
-    np.testing.assert_array_equal(found.scene[~known], found.color[~known])
+    np.testing.assert_allclose(behind[known], WALL[known], rtol=0.02)
+    np.testing.assert_array_equal(scene[known], photograph[known])
+    np.testing.assert_array_equal(scene[~known], found.color[~known])
     assert not known[0, 0]
     assert not known[SIDE // 2, SIDE // 2]
 
@@ -52,7 +53,7 @@ def test_a_subject_like_its_backdrop_is_left_as_it_is():
     assert found.offset is None
     np.testing.assert_array_equal(found.alpha, mask)
     np.testing.assert_allclose(found.color, wall * mask[..., None], atol=1e-6)
-    assert not found.behind.any()
+    assert found.uncut is None
 
 
 def test_a_cluttered_backdrop_is_trusted_little():

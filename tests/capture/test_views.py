@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from beam_warp.capture.views import Backdrop, CapturedView
+from beam_warp.capture.mattes import Uncut
+from beam_warp.capture.views import CapturedView
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.world.camera import Camera
 
@@ -13,8 +14,8 @@ CAMERA = Camera(7, 5, 6.0, 5.0, 3.2, 2.4, np.eye(4))
 def view() -> CapturedView:
     rng = np.random.default_rng(0)
     color, alpha, doubt = (rng.random((5, 7, *more), np.float32) for more in ((3,), (), ()))
-    backdrop = Backdrop(*rng.random((2, 5, 7, 3), np.float32))
-    return CapturedView(name="a", camera=CAMERA, color=color, alpha=alpha, doubt=doubt, backdrop=backdrop)
+    uncut = Uncut(*rng.random((2, 5, 7, 3), np.float32))
+    return CapturedView(name="a", camera=CAMERA, color=color, alpha=alpha, doubt=doubt, uncut=uncut)
 
 
 def test_a_point_of_a_crop_is_the_same_pixel():
@@ -25,7 +26,7 @@ def test_a_point_of_a_crop_is_the_same_pixel():
     np.testing.assert_array_equal(part.color, given.color[1:4, 2:6])
     np.testing.assert_array_equal(part.alpha, given.alpha[1:4, 2:6])
     np.testing.assert_array_equal(part.doubt, given.doubt[1:4, 2:6])
-    np.testing.assert_array_equal(part.backdrop.scene, given.backdrop.scene[1:4, 2:6])
+    np.testing.assert_array_equal(part.uncut.scene, given.uncut.scene[1:4, 2:6])
 
 
 def test_a_reduction_is_the_mean_of_its_pixels_and_its_camera_sees_them():
@@ -35,7 +36,7 @@ def test_a_reduction_is_the_mean_of_its_pixels_and_its_camera_sees_them():
     np.testing.assert_allclose(half.color[1, 2], given.color[2:4, 4:6].mean(axis=(0, 1)), rtol=1e-6)
     np.testing.assert_allclose(half.alpha[0, 1], given.alpha[0:2, 2:4].mean(), rtol=1e-6)
     np.testing.assert_allclose(half.doubt[0, 1], given.doubt[0:2, 2:4].mean(), rtol=1e-6)
-    np.testing.assert_allclose(half.backdrop.behind[1, 2], given.backdrop.behind[2:4, 4:6].mean(axis=(0, 1)), rtol=1e-6)
+    np.testing.assert_allclose(half.uncut.behind[1, 2], given.uncut.behind[2:4, 4:6].mean(axis=(0, 1)), rtol=1e-6)
     point = np.array([[0.3, -0.2, 2.0]])
     np.testing.assert_allclose(half.camera.project(point)[0, :2], given.camera.project(point)[0, :2] / 2.0)
     assert view().reduced(1).camera.width == 7
@@ -46,7 +47,7 @@ def test_gains_are_those_of_light_and_not_of_coverage():
     found = given.brightened(gains)
     for one, other in (
         (found.color, given.color),
-        *zip(vars(found.backdrop).values(), vars(given.backdrop).values(), strict=True),
+        *zip(vars(found.uncut).values(), vars(given.uncut).values(), strict=True),
     ):
         np.testing.assert_array_equal(one, other * gains)
     np.testing.assert_array_equal(found.alpha, given.alpha)

@@ -13,7 +13,8 @@ from reference.rasterizing import decide, replay
 from scipy import ndimage
 from support.moving_ball import ball_cloud, ball_views, block_means, rig
 
-from beam_warp.capture.views import Backdrop, CapturedView
+from beam_warp.capture.mattes import Uncut
+from beam_warp.capture.views import CapturedView
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
 from beam_warp.raster.depth_normals import LARGEST_JUMP, STEEPEST
 from beam_warp.raster.gbuffer import rasterize
@@ -143,7 +144,7 @@ def with_backdrop(rng, view):
     """The same before a backdrop that is known in two thirds of the columns."""
     scene, behind = rng.uniform(size=(2, *view.color.shape)).astype(np.float32)
     behind[:, ::3] = 0.0
-    return replace(view, backdrop=Backdrop(scene, behind))
+    return replace(view, uncut=Uncut(scene, behind))
 
 
 def set_up(views, cloud, device, samples=1, kind=TargetSet, **options):
@@ -191,9 +192,9 @@ class Twin:
         weights, everywhere = self.weights, np.ones(self.view.alpha.shape)
         linear, covered = block_means(drawn.channels, self.samples), block_means(drawn.alpha, self.samples)
         target, share = self.view.color.astype(np.float64), 1.0
-        if self.view.backdrop is not None:
-            target = self.view.backdrop.scene.astype(np.float64)
-            linear = linear + (1.0 - covered) * self.view.backdrop.behind.astype(np.float64)
+        if self.view.uncut is not None:
+            target = self.view.uncut.scene.astype(np.float64)
+            linear = linear + (1.0 - covered) * self.view.uncut.behind.astype(np.float64)
             share = MATTE_SHARE
         color, target = encode(linear), linear_to_srgb(target)
         trust = (everywhere if self.view.doubt is None else 1.0 - self.view.doubt.astype(np.float64))[..., None]
@@ -266,7 +267,7 @@ def test_before_a_known_backdrop_a_matte_that_is_wrong_counts_less(device):
     wrong = replace(view, color=color, alpha=grown)
     scene = color + (1.0 - alpha)[..., None] * behind
     pulls = []
-    for given in (wrong, replace(wrong, backdrop=Backdrop(scene, np.broadcast_to(behind, scene.shape)))):
+    for given in (wrong, replace(wrong, uncut=Uncut(scene, np.broadcast_to(behind, scene.shape)))):
         targets, parameters = set_up([given], cloud, device, kind=ViewTargets)
         targets.draw(0, parameters.drawn)
         targets.add_losses(0, LossWeights(l1=1.0, ssim=0.2, alpha=1.0))
