@@ -159,10 +159,21 @@ def survey_sequence(sequence: GaussianSequence, bounds: Mapping[str, float] | No
         left |= {
             name
             for name in found.varying & held.keys() - left
-            if departure(name, held[name], arrays[name]) > (bounds or {}).get(name, 0.0)
+            if not _is_near(name, held[name], arrays[name], (bounds or {}).get(name, 0.0))
         }
     survey = Survey.of(found, sequence)
     return survey if bounds is None else replace(survey, varying=survey.varying & left)
+
+
+def _is_near(name: str, one: NDArray[Any], other: NDArray[Any], bound: float) -> bool:
+    """Return whether two arrays are within a bound of each other, in each precision that a file may hold them in."""
+    if not departure(name, one, other) <= bound:
+        return False
+    channel = CHANNELS[name]
+    if channel.half_type_name is None or channel.position_like or other.dtype.kind != "f":
+        return True
+    with np.errstate(over="ignore", invalid="ignore"):
+        return departure(name, one.astype(np.float16), other.astype(np.float16)) <= bound
 
 
 def require_upright(axes: str) -> None:

@@ -143,6 +143,7 @@ def assert_within(found, wanted, bounds):
     full_float=st.booleans(),
 )
 @example(frames=12, noise=0.0, turn=0.0, seed=1, scale=8.0, length=5, full_float=False)
+@example(frames=6, noise=0.0, turn=0.0, seed=99, scale=0.1, length=1, full_float=False)  # as halves, scales leave
 def test_every_frame_is_within_its_bounds(tmp_path_factory, frames, noise, turn, seed, scale, length, full_float):
     folder, bounds = tmp_path_factory.mktemp("keys"), {name: scale * bound for name, bound in BOUNDS.items()}
     how = {"full_float": full_float, "segment_length": length}
