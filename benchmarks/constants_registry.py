@@ -375,6 +375,7 @@ MATERIALS = (
             ("LEAST_CHANCE", "Least probability of a roughness."),
             ("LEAST_SPREAD", "Least standard deviation of a colour."),
             ("MODEL_ERROR", "Error of exposures that halves of the points share [logarithm]."),
+            ("FALLOFF_ERROR", "Error of the power of vignetting that halves of the points share."),
         )
     ),
     *(

@@ -78,6 +78,7 @@ alone."""
 
 NAMED: Mapping[str, Collection[str]] = {
     "exposure": ("camera-exposure", "camera-white-balance"),
+    "vignetting": ("vignetting",),
     "noise": ("noisy-images",),
     "masks": ("mask-offset",),
     "cutouts": ("mask-offset",),
@@ -218,7 +219,8 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
     """Return parameters that the product reports, beside those that were injected.
 
     ``light_stops``: how much brighter the light was made; it should be minus what was injected.
-    ``exposure_spread``: largest exposure of a camera over the mean [stop]; 0 where none is known.
+    ``exposure_spread``: largest exposure of a camera over the mean [stop]; 0 where none is known. ``falloff``: power
+    of the cosine by which vignetting was undone.
     """
     stops = [flaws.get("exposure_stops", 0.0) for flaws in copy.injected["cameras"].values()]
     exposures = reconstruction["exposures"]
@@ -228,8 +230,16 @@ def recovered(copy: FlawedCapture, reconstruction: Row, decomposition: Row) -> R
         "light_stops_injected": float(np.log2(copy.injected["light"].get("gain", 1.0))),
         "exposure_spread": max(spreads, default=0.0),
         "exposure_spread_injected": max(map(abs, stops), default=0.0),
+        "falloff_injected": copy.injected["falloff"],
+        **({} if exposures is None else vignetting_of(exposures)),
         **({} if exposures is None else gain_errors(copy.injected["cameras"], exposures["cameras"])),
     }
+
+
+def vignetting_of(exposures: Row) -> dict[str, float]:
+    """Return the power of vignetting that was found, its error, and what was undone."""
+    undone = exposures["falloff"] * exposures["falloff_undone"]
+    return {"falloff_found": exposures["falloff"], "falloff_error": exposures["falloff_error"], "falloff": undone}
 
 
 def recovered_poses(

@@ -1,4 +1,4 @@
-"""Exposures and white balances of a rig's cameras: what they are, how sure, where they are kept, and what they undo.
+"""Exposures, white balances, vignetting of a rig's cameras: what they are, how sure, where kept, what they undo.
 
 Reconstruction finds them (`beam_warp.reconstruction.photometry`) and writes them beside its result, so that whatever
 goes back to the photographs later sees the colours that the Gaussians were fitted to. Only training records change.
@@ -19,6 +19,9 @@ from beam_warp.capture.side_file import SideFile
 from beam_warp.checks import require_array, require_finite, require_number
 
 NEUTRAL = (1.0, 1.0, 1.0)
+
+SHOWN_DEGREES = 20
+"""Angle to the optical axis at which a finding says how dark vignetting is."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,10 @@ class CameraExposure:
 
 @dataclass(frozen=True)
 class RigExposures(SideFile):
-    """Exposures and white balances of the cameras of a rig.
+    """Exposures, white balances and vignetting of the cameras of a rig.
+
+    Vignetting is a power of the cosine of the angle to the optical axis, one for all cameras; a thin lens has the
+    fourth.
 
     Attributes:
         cameras: One for each camera.
@@ -58,6 +64,9 @@ class RigExposures(SideFile):
         balance_error: Likewise of white balances.
         exposure_undone: Whether differences of exposure are beyond chance, and undone.
         balance_undone: Likewise of white balance.
+        falloff: Power of the cosine that images are darkened by.
+        falloff_error: Its standard error.
+        falloff_undone: Whether vignetting is beyond chance, and undone.
     """
 
     FILE = "exposures.json"
@@ -68,11 +77,15 @@ class RigExposures(SideFile):
     balance_error: float = 0.0
     exposure_undone: bool = False
     balance_undone: bool = False
+    falloff: float = 0.0
+    falloff_error: float = 0.0
+    falloff_undone: bool = False
 
     def put_right(self, record: CaptureRecord) -> CaptureRecord:
-        """Return a record whose views are without the gains of its camera."""
+        """Return a record whose views are without the gains and the vignetting of its camera."""
         gains = next((found.gains for found in self.cameras if found.camera == record.camera_name), NEUTRAL)
-        return record if gains == NEUTRAL else replace(record, gains=gains)
+        falloff = self.falloff if self.falloff_undone else 0.0
+        return record if gains == NEUTRAL and not falloff else replace(record, gains=gains, falloff=falloff)
 
     def findings(self) -> list[Finding]:
         """Return what a user should know."""
@@ -91,14 +104,24 @@ class RigExposures(SideFile):
                 f"{100.0 * self.balance_error:.1f} %, at most {100.0 * _largest(most.balance):.1f} %, and were matched"
             )
             found.append(Finding("warning", "camera-white-balance", what, most.camera, "Match white balances before."))
+        if self.falloff_undone:
+            what = (
+                f"images darken off the axis by the cosine's power of {self.falloff:.1f} ± {self.falloff_error:.1f}, "
+                f"{100.0 * (1.0 - np.cos(np.radians(SHOWN_DEGREES)) ** self.falloff):.0f} % at {SHOWN_DEGREES}°, and "
+                "were brightened there"
+            )
+            found.append(Finding("warning", "vignetting", what, "", "Correct vignetting before."))
         return found
 
     @classmethod
     def from_dict(cls, content: Any) -> RigExposures:
         """Take what `as_dict` returned."""
         cameras = tuple(CameraExposure(**camera) for camera in content["cameras"])
-        errors = {name: require_number(name, content[name], 0.0) for name in ("exposure_error", "balance_error")}
-        return cls(cameras, **errors, **{name: bool(content[name]) for name in ("exposure_undone", "balance_undone")})
+        content = {"falloff": 0.0, "falloff_error": 0.0, "falloff_undone": False} | content  # files of 0.2 lack these
+        whats = ("exposure", "balance", "falloff")
+        errors = {name: require_number(name, content[name], 0.0) for name in (f"{what}_error" for what in whats)}
+        undone = {name: bool(content[name]) for name in (f"{what}_undone" for what in whats)}
+        return cls(cameras, falloff=require_number("falloff", content["falloff"], -64.0, 64.0), **errors, **undone)
 
 
 def scale_errors(gains: ArrayLike) -> tuple[float, float, float]:

@@ -84,6 +84,7 @@ class CaptureRecord:
         mask_excess: How far coverage reaches beyond the subject [pixel of `view`], which is taken in as it is read.
         moment: When videos show the image, on the clock of their files [s].
         gains: Factors of red, green and blue that the camera is known to be off by; `view` undoes them.
+        falloff: Power of the cosine of the angle to the optical axis that darkens the image; `view` undoes it.
     """
 
     camera_name: str
@@ -101,6 +102,7 @@ class CaptureRecord:
     mask_excess: float = 0.0
     moment: float = 0.0
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    falloff: float = 0.0
 
     @property
     def name(self) -> str:
@@ -174,6 +176,8 @@ class CaptureRecord:
         )
         if self.gains != (1.0, 1.0, 1.0):
             found = found.brightened(1.0 / np.array(self.gains))
+        if self.falloff:
+            found = found.brightened(self.camera.axis_cosines()[..., None] ** -self.falloff)
         return taken_in(found, self.mask_excess)
 
     def truth(self) -> Image:

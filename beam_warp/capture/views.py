@@ -98,7 +98,7 @@ class CapturedView:
         )
 
     def brightened(self, factors: ArrayLike) -> CapturedView:
-        """Return the view with its light times a factor, or one for each of red, green and blue."""
+        """Return the view with its light times a factor, one for each of red, green and blue, or ``(H, W, 1)``."""
         gains = np.asarray(factors, np.float32)
         uncut = None if self.uncut is None else self.uncut.mapped(lambda image: image * gains)
         return replace(self, color=self.color * gains, uncut=uncut)

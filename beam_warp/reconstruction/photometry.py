@@ -1,26 +1,29 @@
-"""Exposures and white balances of a rig's cameras, from what they show of the same points of the surface.
+"""Exposures, white balances and vignetting of a rig's cameras, from what they show of the same points of the surface.
 
 A photograph of a matte surface tells its camera's gains; gloss does not look alike from everywhere, and shifts what a
 camera seems to be off by. Where the light of a capture is known, gloss is known but for its roughness:
 
-    c[v, i] = g[v] (d[i] + sum over k of w[i, k] s[k, v, i])
+    c[v, i] = g[v] cos^n[v, i] (d[i] + sum over k of w[i, k] s[k, v, i])
 
-with the colour c that view v shows of point i, its gains g, the point's diffuse colour d, and the highlight s that a
-smooth surface there would show at roughness k: the light, blurred by the lobe, in the mirrored direction, times the
-specular albedo of a dielectric. A material of one roughness that nothing hides has a weight w of 1 for it and 0 for
-others. So the prior of the weights is normal with the mean and covariance of such a choice, whose probabilities all
-points share: what is left to 1 is hidden. All begin alike, and are then the mean of the points' weights. Gains are
-those of least squares with all points' unknowns eliminated. Each point has a deviation of its own, so that fine
-texture, and places where the surface is wrong, count little.
+with the colour c that view v shows of point i, its gains g, the cosine of the angle to the optical axis and the power n
+of the rig's vignetting, the point's diffuse colour d, and the highlight s that a smooth surface there would show at
+roughness k: the light, blurred by the lobe, in the mirrored direction, times the specular albedo of a dielectric. A
+material of one roughness that nothing hides has a weight w of 1 for it and 0 for others. So the prior of the weights is
+normal with the mean and covariance of such a choice, whose probabilities all points share: what is left to 1 is hidden.
+All begin alike, and are then the mean of the points' weights. Gains are those of least squares with all points'
+unknowns eliminated. Each point has a deviation of its own, so that fine texture, and places where the surface is wrong,
+count little.
 
 How sure the gains are is asked twice. The bright and the dark half of the points must tell the same, for gloss is a
 larger part of what a dark point shows: half of their difference is as large as the error. Of what the model of gloss
 changes, half may be wrong. Exposures and white balances stay as they are unless they are beyond that, and exposures
 beyond what halves share as well (an F test of the mean squares), each on its own evidence. Then they shrink by what the
-error explains of them. So a sound capture stays as it is, to the bit. The mean over the cameras is held.
+error explains of them. So a sound capture stays as it is, to the bit. The mean over the cameras is held. The power of
+vignetting is judged likewise, and is not among the unknowns unless it is beyond doubt: 0 holds of lenses whose images
+were corrected.
 
 Sources: empirical Bayes, Efron and Morris 1973; random effects, Laird and Ware 1982; Cauchy's weights, Holland and
-Welsch 1977; the split sum, Karis 2013.
+Welsch 1977; the split sum, Karis 2013; vignetting as a power of the cosine, the fourth for a thin lens, Horn 1986.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
-from scipy.special import fdtri
+from scipy.special import fdtri, ndtri
 
 from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.capture.views import CapturedView
@@ -65,6 +68,10 @@ CHANCE = 1e-3
 MODEL_ERROR = 0.015
 """Error of the logarithms of exposures that halves of the points share, because the surface is wrong: cameras of
 walker, runner and robot, whose exposures are equal, seem to differ by 0.006, 0.007 and 0.018 (root mean square)."""
+
+FALLOFF_ERROR = 0.15
+"""Error of the power of vignetting that halves of the points share, because the surface is wrong: that of walker,
+runner and robot, whose cameras are pinholes, seems to be 0.02, -0.12 and -0.14."""
 
 FIRST_POINTS, MOST_POINTS = 1_024, 4_096
 """Most points that are compared, evenly chosen: at first, and where these say that something may be wrong."""
@@ -97,25 +104,41 @@ EXPOSURE, BALANCE = np.full((3, 1), 1.0 / 3.0), np.eye(3) - 1.0 / 3.0
 
 @dataclass(frozen=True, eq=False)
 class SolvedGains:
-    """Natural logarithms of the gains of views, each of mean 0 over the views, ``(V, 3)``.
+    """Natural logarithms of the gains of views, each of mean 0 over the views, ``(V, 3)``, and vignetting.
 
     Attributes:
         logs: Of red, green and blue.
         apart: Half the difference of what the bright and the dark half of the points tell.
         gloss: Half of what the model of gloss changes.
+        falloff: Power of the cosine that darkens images off the axis.
+        falloff_error: Its standard error.
     """
 
     logs: NDArray[np.float64]
     apart: NDArray[np.float64]
     gloss: NDArray[np.float64]
+    falloff: float = 0.0
+    falloff_error: float = 0.0
 
     def error(self, what: NDArray[np.float64]) -> float:
         """Return the standard error, root mean square, of linear functions of the logarithms, ``(3, k)``."""
         return float(np.sqrt(np.mean(np.square(self.apart @ what)) + np.mean(np.square(self.gloss @ what))))
 
     def may_be_wrong(self) -> bool:
-        """Return whether exposures or white balances differ by more than their standard error."""
-        return any(root_mean_square(self.logs @ what) > self.error(what) for what in (EXPOSURE, BALANCE))
+        """Return whether exposures, white balances or vignetting are larger than their standard error."""
+        return self.may_vignette or any(
+            root_mean_square(self.logs @ what) > self.error(what) for what in (EXPOSURE, BALANCE)
+        )
+
+    @property
+    def may_vignette(self) -> bool:
+        """Whether images are darker off the axis by more than the standard error."""
+        return self.falloff > self.falloff_error
+
+    @property
+    def vignettes(self) -> bool:
+        """Whether images are darker off the axis beyond chance: none is brighter there."""
+        return bool(self.falloff > -ndtri(CHANCE) * np.hypot(self.falloff_error, FALLOFF_ERROR))
 
 
 def may_compare(views: Sequence[CapturedView]) -> bool:
@@ -132,7 +155,7 @@ def find_exposures(
     *,
     device: str | None = None,
 ) -> RigExposures | None:
-    """Find exposures and white balances of the cameras of a rig.
+    """Find exposures, white balances and vignetting of the cameras of a rig.
 
     Args:
         names: Names of the cameras.
@@ -157,7 +180,12 @@ def find_exposures(
         away = np.stack([view.camera.position for view in views])[:, None] - cloud.positions[chosen].astype(np.float64)
         away /= np.linalg.norm(away, axis=2, keepdims=True)
         gloss = highlights(normals[chosen].astype(np.float64), away, environment, device)
-        solved = solve_gains(samples[:, chosen], gloss, most)
+        axes = np.stack([view.camera.forward for view in views])
+        cosines = -(away * axes[:, None]).sum(axis=2)
+        solved = solve_gains(samples[:, chosen], gloss, cosines, most)
+        if solved is not None and solved.may_vignette:
+            darkened = solve_gains(samples[:, chosen], gloss, cosines, most, vignetting=True)
+            solved = darkened if darkened is not None and darkened.vignettes else solved
         if solved is None or not solved.may_be_wrong():
             break
     return None if solved is None else judged(names, solved)
@@ -202,14 +230,22 @@ def highlights(
 
 
 def solve_gains(
-    samples: NDArray[np.floating], gloss: NDArray[np.floating], most: int = FIRST_POINTS
+    samples: NDArray[np.floating],
+    gloss: NDArray[np.floating],
+    cosines: NDArray[np.floating],
+    most: int = FIRST_POINTS,
+    *,
+    vignetting: bool = False,
 ) -> SolvedGains | None:
     """Solve for the gains of views.
 
     Args:
         samples: Scene-linear colour and weight of each point in each view, 0 where it is not seen, ``(V, N, 4)``.
         gloss: Highlights of a smooth dielectric for each roughness, ``(V, N, 3, K)``.
+        cosines: Of the angle between each point and the optical axis of each view, ``(V, N)``.
         most: Most points that are compared, evenly chosen.
+        vignetting: Whether vignetting is among the unknowns; if not, gains are those of lenses without, and its power
+            is what a step of Newton's from there finds, a third to all of it.
 
     Returns:
         The gains, 0 of views that share nothing with others; None where there are fewer than `FEWEST_POINTS`.
@@ -227,21 +263,35 @@ def solve_gains(
     scale = means[rows, None, :]
     relative, seen = colors[:, rows].transpose(1, 0, 2) / scale, weights[:, rows].T
     shine = gloss[:, rows].transpose(1, 0, 2, 3) / scale[..., None]
+    # A point that a view does not see may be behind it.
+    falls = np.log(np.where(seen > 0.0, cosines[:, rows].T, 1.0))
     levels = means[rows] @ LUMINANCE
     is_bright = levels > np.median(levels)
-    every = np.ones(len(rows), bool)
-    asked = ((every, shine), (every, shine[..., :0]), (is_bright, shine), (~is_bright, shine))
+    all_of_them = np.ones(len(rows), bool)
+    asked = ((all_of_them, shine), (all_of_them, shine[..., :0]), (is_bright, shine), (~is_bright, shine))
     with ThreadPoolExecutor(len(asked)) as pool:
-        logs, matte, bright, dark = pool.map(
-            lambda it: _Solver(relative[it[0]], seen[it[0]], it[1][it[0]]).solve(), asked
+        every, matte, bright, dark = pool.map(
+            lambda it: _Solver(relative[it[0]], seen[it[0]], it[1][it[0]], falls[it[0]]).solve(vignetting), asked
         )
-    return SolvedGains(logs, 0.5 * (bright - dark), 0.5 * (logs - matte))
+    apart, of_gloss = (0.5 * (one - other) for one, other in ((bright, dark), (every, matte)))
+    views = len(samples)
+    return SolvedGains(
+        *(logs[:-1].reshape(views, 3) for logs in (every, apart, of_gloss)),
+        falloff=float(every[-1]),
+        falloff_error=float(np.hypot(apart[-1], of_gloss[-1])),
+    )
 
 
 class _Solver:
     """Rounds of least squares over points, ``(N,)``, and the channels of views, ``(3 V,)``."""
 
-    def __init__(self, colors: NDArray[np.float64], weights: NDArray[np.float64], gloss: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        colors: NDArray[np.float64],
+        weights: NDArray[np.float64],
+        gloss: NDArray[np.float64],
+        falls: NDArray[np.float64],
+    ) -> None:
         count, views, _, kinds = gloss.shape
         self._colors = colors.reshape(count, -1)
         self._weights = np.repeat(weights, 3, axis=1)
@@ -251,28 +301,41 @@ class _Solver:
         seen = (self._weights > 0.0).sum(axis=1)
         self._middle = np.stack([(seen - 1) // 2, seen // 2], axis=1)
         self._factors = self._weights / LEAST_SPREAD**2
-        self._logs = np.zeros(3 * views)
-        self._known = np.flatnonzero(self._weights.any(axis=0))
-        shared = max(len(self._known) // 3, 1)
-        self._held = np.eye(3 * shared) - np.kron(np.full((shared, shared), 1.0 / shared), np.eye(3))
+        self._falls = np.repeat(falls, 3, axis=1)
+        self._logs, self._falloff = np.zeros(3 * views), 0.0
+        self._known = np.append(np.flatnonzero(self._weights.any(axis=0)), 3 * views)
+        shared = len(self._known) // 3
+        self._held = np.eye(len(self._known))
+        self._held[:-1, :-1] -= np.kron(np.full((shared, shared), 1.0 / max(shared, 1)), np.eye(3))
 
-    def solve(self) -> NDArray[np.float64]:
-        """Return the logarithms of the gains, ``(V, 3)``; 0 of views that see nothing."""
+    def solve(self, vignetting: bool) -> NDArray[np.float64]:
+        """Return the logarithms of the gains, 0 of views that see nothing, and the power of vignetting, ``(3 V + 1,)``.
+
+        Without ``vignetting``, that is the power of one step beyond gains of lenses without.
+        """
+        moved = slice(None) if vignetting else slice(-1)
         for _ in range(ROUNDS):
             matrix, right = self._round()
-            among = self._held @ matrix[np.ix_(self._known, self._known)] @ self._held
-            change = np.linalg.lstsq(among, self._held @ right[self._known], rcond=1e-9)[0]
-            self._logs[self._known] += change
+            change = self._step(matrix, right, moved)
+            self._logs[self._known[:-1]] += change[: len(self._known) - 1]
+            self._falloff += change[-1] if vignetting else 0.0
             if np.abs(change).max(initial=0.0) < SETTLED:
                 break
-        return self._logs.reshape(-1, 3)
+        if not vignetting:
+            self._falloff = float(self._step(*self._round(), slice(None))[-1])
+        return np.array([*self._logs, self._falloff])
+
+    def _step(self, matrix: NDArray[np.float64], right: NDArray[np.float64], moved: slice) -> NDArray[np.floating]:
+        """Return the change of those numbers that are known and moved, the gains' mean held."""
+        held, known = self._held[moved, moved], self._known[moved]
+        return np.linalg.lstsq(held @ matrix[np.ix_(known, known)] @ held, held @ right[known], rcond=1e-9)[0]
 
     def _round(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return normal equations for a change of the gains, the points' unknowns eliminated at the gains so far.
+        """Return normal equations for a change of gains and vignetting, points' unknowns eliminated at those so far.
 
         Then the chances of roughnesses and the weights are brought up to date.
         """
-        gains, basis = np.exp(self._logs), self._basis
+        gains, basis = np.exp(self._logs + self._falloff * self._falls), self._basis
         weighted = basis * (self._factors * gains**2)[:, None]
         precision = np.diag(np.full(basis.shape[1], 1e-9))
         precision[3:, 3:] = np.linalg.inv(
@@ -285,9 +348,13 @@ class _Solver:
         model = plain * gains
         left = self._colors - model
         weighted *= plain[:, None]
-        rows = (np.linalg.cholesky(spread).transpose(0, 2, 1) @ weighted).reshape(-1, model.shape[1])
-        matrix = np.diag((self._factors * model**2).sum(axis=0)) - rows.T @ rows
-        right = (self._factors * model * left).sum(axis=0)
+        weighted = np.dstack([weighted, (weighted * self._falls[:, None]).sum(axis=2)])
+        rows = (np.linalg.cholesky(spread).transpose(0, 2, 1) @ weighted).reshape(-1, weighted.shape[2])
+        own, force = self._factors * model**2, self._factors * model * left
+        matrix = np.diag(np.append(own.sum(axis=0), (own * self._falls**2).sum()))
+        matrix[-1, :-1] = matrix[:-1, -1] = (own * self._falls).sum(axis=0)
+        matrix -= rows.T @ rows
+        right = np.append(force.sum(axis=0), (force * self._falls).sum())
         self._learn(found[:, 3:, 0], left)
         return matrix, right
 
@@ -303,7 +370,7 @@ class _Solver:
 
 
 def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
-    """Return the exposures and white balances of cameras, undone as far as they are beyond chance.
+    """Return exposures, white balances and vignetting of cameras, undone as far as they are beyond chance.
 
     Args:
         names: Names of the cameras.
@@ -324,6 +391,9 @@ def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
         balance_error=balance_error,
         exposure_undone=kept > 0.0,
         balance_undone=kept_balance > 0.0,
+        falloff=solved.falloff,
+        falloff_error=solved.falloff_error,
+        falloff_undone=solved.vignettes,
     )
 
 

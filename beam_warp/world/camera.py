@@ -141,6 +141,10 @@ class Camera:
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         return rays @ self.camera_to_world[:3, :3].T
 
+    def axis_cosines(self) -> NDArray[np.float64]:
+        """Return the cosine of the angle between the optical axis and each pixel's direction, ``(height, width)``."""
+        return self.directions() @ self.forward
+
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
         """Project world points.
 

@@ -38,6 +38,19 @@ def test_views_of_training_records_are_without_the_gains(tmp_path):
     assert corrected[3] is records[3]
 
 
+def test_vignetting_is_undone_off_the_axis_alone(tmp_path):
+    record = Capture.read(write_capture(tmp_path / "ball", (0,))).records[0]
+    camera, found = record.camera, RigExposures((), falloff=4.0, falloff_error=0.5, falloff_undone=True)
+    x = (np.arange(camera.width) + 0.5 - camera.center_x) / camera.focal_x
+    y = (np.arange(camera.height) + 0.5 - camera.center_y) / camera.focal_y
+    lens = (1.0 + x**2 + y[:, None] ** 2)[..., None] ** -2.0  # the fourth power of the cosine
+    view = found.put_right(record).view()
+    np.testing.assert_allclose(view.color * lens, record.view().color, rtol=1e-5)
+    np.testing.assert_array_equal(view.alpha, record.view().alpha)
+    assert "by the cosine's power of 4.0 ± 0.5, 22 % at 20°" in found.findings()[0].what
+    assert replace(found, falloff_undone=False).put_right(record) is record
+
+
 def test_findings_say_how_much_and_who_most():
     exposure, balance = FOUND.findings()
     assert (exposure.code, exposure.where) == ("camera-exposure", "c0")
@@ -51,6 +64,9 @@ def test_files_come_back_and_damage_is_named(tmp_path):
     assert RigExposures.read(tmp_path) is None
     path = tmp_path / RigExposures.FILE
     path.write_text(json.dumps({"key": "k", **FOUND.as_dict()}))
+    assert RigExposures.read(tmp_path) == FOUND
+    older = {name: value for name, value in FOUND.as_dict().items() if not name.startswith("falloff")}
+    path.write_text(json.dumps({"key": "k", **older}))
     assert RigExposures.read(tmp_path) == FOUND
     wrong_gain = FOUND.as_dict() | {"cameras": [{"camera": "a", "gains": [0.0, 1.0, 1.0]}]}
     for content in ("[]", '{"cameras": 3}', '{"cameras": []}', json.dumps(wrong_gain)):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from beam_warp.capture.exposures import RigExposures
 from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS
 from beam_warp.reconstruction import photometry
@@ -23,6 +24,7 @@ from beam_warp.reconstruction.photometry import (
 from beam_warp.world.environment import EnvironmentMap
 
 VIEWS, POINTS = 12, 600
+AXIAL = np.ones((VIEWS, POINTS))
 MEAN, REST = np.full((3, 1), 1.0 / 3.0), np.eye(3) - 1.0 / 3.0
 
 
@@ -65,7 +67,7 @@ def test_gains_of_matte_points_are_exact(lit, rng):
     diffuse, _, weights, gloss = lit
     logs = drawn_gains(rng, 0.2, 0.05)
     colors = np.broadcast_to(diffuse, (VIEWS, POINTS, 3))
-    solved = solve_gains(seen(colors, weights, logs), np.zeros_like(gloss))
+    solved = solve_gains(seen(colors, weights, logs), np.zeros_like(gloss), AXIAL)
     np.testing.assert_allclose(solved.logs, logs, atol=1e-4)
     assert solved.error(np.eye(3)) < 1e-4
     found = judged([str(view) for view in range(VIEWS)], solved)
@@ -76,7 +78,7 @@ def test_gloss_is_told_from_gains(lit, rng):
     """Gains are found several times as well as by a model without gloss, and within a few stated errors."""
     diffuse, shine, weights, gloss = lit
     logs = drawn_gains(rng, 0.2, 0.05)
-    solved = solve_gains(seen(diffuse + shine, weights, logs), gloss)
+    solved = solve_gains(seen(diffuse + shine, weights, logs), gloss, AXIAL)
     matte = solved.logs - 2.0 * solved.gloss
     for what in (MEAN, REST):
         assert error_of(solved.logs, logs, what) < 0.5 * error_of(matte, logs, what)
@@ -92,7 +94,7 @@ def test_gloss_is_told_from_gains(lit, rng):
 
 def test_sound_views_stay_to_the_bit(lit):
     diffuse, shine, weights, gloss = lit
-    solved = solve_gains(seen(diffuse + shine, weights, np.zeros((VIEWS, 3))), gloss)
+    solved = solve_gains(seen(diffuse + shine, weights, np.zeros((VIEWS, 3))), gloss, AXIAL)
     assert not solved.may_be_wrong()
     found = judged([str(view) for view in range(VIEWS)], solved)
     assert (found.exposure_undone, found.balance_undone) == (False, False)
@@ -112,7 +114,7 @@ def test_what_a_wrong_surface_shows_is_no_exposure(rng, size, is_undone):
 def test_each_is_judged_by_its_own_evidence(lit, rng):
     diffuse, shine, weights, gloss = lit
     logs = drawn_gains(rng, 0.2, 0.0)
-    found = judged([str(v) for v in range(VIEWS)], solve_gains(seen(diffuse + shine, weights, logs), gloss))
+    found = judged([str(v) for v in range(VIEWS)], solve_gains(seen(diffuse + shine, weights, logs), gloss, AXIAL))
     assert (found.exposure_undone, found.balance_undone) == (True, False)
     for camera in found.cameras:
         np.testing.assert_allclose(camera.gains, camera.gains[0], rtol=1e-12)
@@ -124,7 +126,7 @@ def test_more_points_tell_gains_better(lit, rng):
     logs = drawn_gains(rng, 0.2, 0.05)
     noise = 1.0 + 0.05 * rng.normal(size=(VIEWS, POINTS, 3))
     few, all_of_them = (
-        solve_gains(seen(diffuse * noise, weights, logs), gloss, most) for most in (POINTS // 8, POINTS)
+        solve_gains(seen(diffuse * noise, weights, logs), gloss, AXIAL, most) for most in (POINTS // 8, POINTS)
     )
     assert error_of(all_of_them.logs, logs, np.eye(3)) < 0.6 * error_of(few.logs, logs, np.eye(3))
 
@@ -132,9 +134,37 @@ def test_more_points_tell_gains_better(lit, rng):
 def test_a_view_that_shares_nothing_says_nothing(lit, rng):
     diffuse, shine, weights, gloss = lit
     weights = weights * (np.arange(VIEWS) > 0)[:, None]
-    solved = solve_gains(seen(diffuse + shine, weights, np.zeros((VIEWS, 3))), gloss)
+    solved = solve_gains(seen(diffuse + shine, weights, np.zeros((VIEWS, 3))), gloss, AXIAL)
     np.testing.assert_array_equal(solved.logs[0], 0.0)
-    assert solve_gains(seen(diffuse, 0.0 * weights, np.zeros((VIEWS, 3))), gloss) is None
+    assert solve_gains(seen(diffuse, 0.0 * weights, np.zeros((VIEWS, 3))), gloss, AXIAL) is None
+
+
+@pytest.mark.parametrize("power", [0.0, 4.0])
+def test_vignetting_is_told_from_gains_and_gloss(lit, rng, power):
+    """One power for the rig: found to half of one beside gains, undone only where there is some, and never negative."""
+    diffuse, shine, weights, gloss = lit
+    logs = drawn_gains(rng, 0.2, 0.05)
+    cosines = np.cos(np.radians(rng.uniform(0.0, 20.0, (VIEWS, POINTS))))
+    colors = seen((diffuse + shine) * cosines[..., None] ** power, weights, logs)
+    assert solve_gains(colors, gloss, cosines).may_vignette == (power > 0.0)
+    solved = solve_gains(colors, gloss, cosines, vignetting=True)
+    assert solved.vignettes == (power > 0.0)
+    assert abs(solved.falloff - power) < 0.5
+    assert error_of(solved.logs, logs, np.eye(3)) < 0.02
+    found = judged([str(view) for view in range(VIEWS)], solved)
+    assert [finding.code for finding in found.findings()].count("vignetting") == (power > 0.0)
+    assert RigExposures.from_dict(found.as_dict()) == found
+    brighter = solve_gains(seen((diffuse + shine) * cosines[..., None] ** -4.0, weights, logs), gloss, cosines)
+    assert not brighter.may_vignette
+
+
+def test_vignetting_of_matte_points_is_exact(lit, rng):
+    diffuse, _, weights, gloss = lit
+    cosines = np.cos(np.radians(rng.uniform(0.0, 20.0, (VIEWS, POINTS))))
+    colors = seen(diffuse * cosines[..., None] ** 4.0, weights, np.zeros((VIEWS, 3)))
+    solved = solve_gains(colors, np.zeros_like(gloss), cosines, vignetting=True)
+    np.testing.assert_allclose(solved.falloff, 4.0, atol=0.01)
+    np.testing.assert_allclose(solved.logs, 0.0, atol=1e-4)
 
 
 def test_a_uniform_light_is_mirrored_as_the_albedo_says():

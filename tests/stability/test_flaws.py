@@ -207,6 +207,11 @@ class TestWrite:
             gains = 2.0 ** said["exposure_stops"] * np.array([1.0 + red, 1.0, 1.0 + blue])
             np.testing.assert_allclose(mine.color.sum((0, 1)) / clean.color.sum((0, 1)), gains, rtol=1e-3)
 
+    def test_vignetting_is_the_power_of_the_cosine(self, flawed, tiny_capture):
+        for mine, clean in views(flawed("vignetting", size=0.5).capture, tiny_capture):
+            cosine = clean.camera.directions() @ clean.camera.forward
+            np.testing.assert_allclose(mine.color, clean.color * cosine[..., None] ** 2, rtol=2e-3, atol=1e-5)
+
     def test_photographs_hide_where_the_subject_ends(self, flawed, tiny_capture):
         copy = flawed("masks")
         for record, (mine, clean) in zip(copy.capture.records, views(copy.capture, tiny_capture), strict=True):

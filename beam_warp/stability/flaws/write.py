@@ -38,14 +38,16 @@ BLOT_PIXELS, BLOTTED_PART = 8.0, 0.25
 CLIPPED_PART = 0.02
 JPEG_LOSS = 10
 MISSING_CAMERAS = 2
+COSINE_POWER = 4.0
 HEADROOM = 1e-3
 """Nominal sizes: turn and gain of the light, way of the subject during an exposure, circle of confusion, diameter of
 blots and part of the masks that have them, part of the subject's pixels that are clipped, quality that a JPEG lacks to
-100, and cameras that lack one image. `HEADROOM` is the part of the subject's pixels above white where highlights are
-meant to be kept."""
+100, cameras that lack one image, and the power of the cosine by which a thin lens darkens images. `HEADROOM` is the
+part of the subject's pixels above white where highlights are meant to be kept."""
 
 FLAWS: Mapping[str, str] = {
     "exposure": "exposure up to 0.2 stop and white balance up to 5 % off, a camera",
+    "vignetting": "all images darkened by the fourth power of the cosine of the angle to the optical axis",
     "noise": "photon noise of 2 % at white, read noise of 0.2 %, 8-bit sRGB PNG",
     "plate": "photographs before a grey wall, with exact masks",
     "masks": "masks one pixel too large in half of the cameras, too small in the others, before a grey wall",
@@ -129,6 +131,7 @@ def write_flawed(
         (root / "transforms.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     cameras = {name: found for name, flaw in shot.cameras.items() if (found := flaw.as_dict())}
     injected = {"cameras": cameras, "light": said, "missing": sorted(missing), "white": shot.white}
+    injected["falloff"] = shot.falloff
     return FlawedCapture(Capture.read(folder), shot.white if shot.is_encoded else 1.0, injected)
 
 
@@ -186,6 +189,11 @@ class _Shot:
         """Whether images show the wall, and masks lie beside them."""
         return not self.flaws.isdisjoint(("plate", "masks", "blots", "jpeg"))
 
+    @property
+    def falloff(self) -> float:
+        """Power of the cosine of the angle to the optical axis that darkens images."""
+        return COSINE_POWER * self.size if "vignetting" in self.flaws else 0.0
+
     def files(self, record: CaptureRecord) -> dict[str, str]:
         """Return the names of a record's files, as ``transforms.json`` has them."""
         suffix = "jpg" if "jpeg" in self.flaws else "png" if self.is_encoded else "exr"
@@ -218,7 +226,7 @@ class _Shot:
             color = layers[..., :3] + (1.0 - alpha[..., None]) * wall
             coverage = self._blotted(offset_coverage(alpha, flaws.mask_pixels), record)
             write_png(paths["mask_path"], eight_bits(coverage))
-        light = self._counted(color * flaws.gains, record)
+        light = self._counted(color * flaws.gains * record.camera.axis_cosines()[..., None] ** self.falloff, record)
         if "jpeg" in self.flaws:
             write_jpeg(paths["file_path"], light / self.white, round(100 - JPEG_LOSS * self.size))
         elif self.is_encoded:
