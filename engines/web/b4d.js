@@ -207,24 +207,36 @@ function valuesAt(track, frame, none, start, values) {
     const part = (all) => all.subarray(c * count, (c + 1) * count), out = part(values), at = frame * columns;
     const [wide, octets] = [Float32Array, Int8Array].map((kind) => planes.flatMap((row, k) => (row instanceof kind && weights[at + 1 + k] ? [[row, weights[at + 1 + k]]] : [])));
     if (start) wide.unshift([part(start), 1]);
-    const next = () => wide.shift() ?? [none, 0]; // a row and its weight
-    putSum(out, weights[at], ...(octets.shift() ?? [new Int8Array(none.buffer), 0]), ...next(), ...next());
-    for (const octet of octets) putSum(out, 0, ...octet, out, 1, ...next());
+    const next = () => wide.shift() ?? [none, 0], isOdd = wide.length > 2 && wide.length & 1; // a row and its weight
+    (isOdd ? putThree : putTwo)(out, weights[at], ...(octets.shift() ?? [new Int8Array(none.buffer), 0]), ...next(), ...next(), ...(isOdd ? next() : []));
+    for (const octet of octets) putTwo(out, 0, ...octet, out, 1, ...next());
     while (wide.length) addTwo(out, ...next(), ...next());
   });
   return values;
 }
 
 /** Put an offset, weighted octets and two weighted rows; eight numbers at a time, because the loop itself costs much of such a sum. */
-function putSum(out, offset, o, w, a, p, b, q) {
+function putTwo(out, offset, o, w, a, p, b, q) {
   let i = 0, count = out.length;
   for (; i < (count & 7); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i];
   for (; i < count; i = i + 8 | 0) {
     const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
-    out[i] = offset + w * o[i] + p * a[i] + q * b[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j];
-    out[k] = offset + w * o[k] + p * a[k] + q * b[k], out[l] = offset + w * o[l] + p * a[l] + q * b[l];
-    out[m] = offset + w * o[m] + p * a[m] + q * b[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n];
+    out[i] = offset + w * o[i] + p * a[i] + q * b[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j], out[k] = offset + w * o[k] + p * a[k] + q * b[k];
+    out[l] = offset + w * o[l] + p * a[l] + q * b[l], out[m] = offset + w * o[m] + p * a[m] + q * b[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n];
     out[r] = offset + w * o[r] + p * a[r] + q * b[r], out[s] = offset + w * o[s] + p * a[s] + q * b[s];
+  }
+}
+
+/** The same with three weighted rows. */
+function putThree(out, offset, o, w, a, p, b, q, c, z) {
+  let i = 0, count = out.length;
+  for (; i < (count & 7); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i] + z * c[i];
+  for (; i < count; i = i + 8 | 0) {
+    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
+    out[i] = offset + w * o[i] + p * a[i] + q * b[i] + z * c[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j] + z * c[j];
+    out[k] = offset + w * o[k] + p * a[k] + q * b[k] + z * c[k], out[l] = offset + w * o[l] + p * a[l] + q * b[l] + z * c[l];
+    out[m] = offset + w * o[m] + p * a[m] + q * b[m] + z * c[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n] + z * c[n];
+    out[r] = offset + w * o[r] + p * a[r] + q * b[r] + z * c[r], out[s] = offset + w * o[s] + p * a[s] + q * b[s] + z * c[s];
   }
 }
 
