@@ -21,25 +21,30 @@ Key = tuple[str, str, float]
 
 
 @table("flaws_studio", "flaws_studio_h200.json")
-def scores(result: Row) -> Rows:
+def studio(result: Row) -> Rows:
+    """Return the scores of clean captures, and of those with all of a studio's flaws."""
+    return scores([row for row in result["rows"] if row["case"]["flaw"] in ("clean", "flawed")])
+
+
+def scores(found: Sequence[Row]) -> Rows:
     """Return a row for every flaw and size of every capture, means over seeds: the clean ones first, then the worst."""
     head = ["what is wrong", "ambient occlusion", "base colour, scaled", "its scale", "relit, scaled", "novel views"]
     head += ["normals", "depth [mm]", "roughness", "named"]
-    return [head, *(_cells(label, rows) for label, rows in _groups(result))]
+    return [head, *(_cells(label, rows) for label, rows in _groups(found))]
 
 
 @table("flaws_alone", "flaws_studio_h200.json", "flaws_alone_h200.json")
 def alone(together: Row, result: Row) -> Rows:
-    """Return the scores of clean captures, and of those with one of a studio's flaws."""
-    clean = [row for row in together["rows"] if row["case"]["flaw"] == "clean"]
-    return scores({"rows": [*clean, *result["rows"]]})
+    """Return the scores of clean captures, and of those with one flaw of a studio's or of its lenses."""
+    clean = [row for row in together["rows"] if row["case"]["flaw"] != "flawed"]
+    return scores([*clean, *result["rows"]])
 
 
 @table("flaws_others", "flaws_h200.json", "flaws_alone_h200.json")
 def others(result: Row, newer: Row) -> Rows:
     """Return the scores of clean captures and of those with flaws that were not measured since."""
     known = {"flawed", *(row["case"]["flaw"] for row in newer["rows"])}
-    return scores({"rows": [row for row in result["rows"] if row["case"]["flaw"] not in known]})
+    return scores([row for row in result["rows"] if row["case"]["flaw"] not in known])
 
 
 @table("flaws_mended", "flaws_studio_h200.json")
@@ -49,10 +54,10 @@ def mended(result: Row) -> Rows:
     head = ["what is wrong", "poses before [pixel]", "after", "places before [mm]", "after"]
     head += ["exposure left [%]", "white balance left [%]"]
     rows: list[list[Any]] = [head]
-    for label, found in _groups(result):
+    for label, found in _groups(result["rows"]):
         cells = [f"{_mean(found, 'recovered', key + end):.2g}" for key in keys for end in ("_injected", "")]
         left = [f"{100 * _mean(found, 'recovered', key):.2g}" for key in ("exposure_error", "white_balance_error")]
-        if found[0]["case"]["flaw"] != "clean":
+        if found[0]["case"]["flaw"] == "flawed":
             rows.append([label, *cells, *left])
     return rows
 
@@ -61,8 +66,9 @@ def mended(result: Row) -> Rows:
 def recovered(result: Row) -> Rows:
     """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""
     head = ["what is wrong", "light made brighter [stop]", "should be", "largest exposure found [stop]", "injected"]
+    head += ["vignetting undone [power]", "injected"]
     head += ["base colour within 1, 2 stated errors", "but for its scale", "roughness", "seconds"]
-    return [head, *(_recovered(label, rows) for label, rows in _groups(result))]
+    return [head, *(_recovered(label, rows) for label, rows in _groups(result["rows"]))]
 
 
 @table("flaws_named", "flaws_named_cpu.json")
@@ -87,10 +93,10 @@ def _words(flaw: str, size: float) -> str:
     return ", ".join(filter(None, (words, TIMES.get(size, f"times {size:g}"))))
 
 
-def _groups(result: Row) -> Iterator[tuple[str, list[Row]]]:
+def _groups(found: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
     """Yield the runs of each flaw under its words, in the order of the tables."""
     groups: dict[Key, list[Row]] = {}
-    for row in result["rows"]:
+    for row in found:
         case = row["case"]
         groups.setdefault((case["capture"], case["flaw"], case["size"]), []).append(row)
     captures = list(dict.fromkeys(capture for capture, *_ in groups))
@@ -103,9 +109,10 @@ def _recovered(label: str, rows: Sequence[Row]) -> list[str]:
     """Return the cells of a flaw in the second table."""
     found = [row for row in rows if "scores" in row]
     if not found:
-        return [label, *[""] * 8]
-    stops, spread = (_mean(found, "recovered", key) for key in ("light_stops", "exposure_spread"))
-    should, injected = (_mean(found, "recovered", f"{key}_injected") for key in ("light_stops", "exposure_spread"))
+        return [label, *[""] * 10]
+    keys = ("light_stops", "exposure_spread", "falloff")
+    stops, spread, falloff = (_mean(found, "recovered", key) for key in keys)
+    should, injected, true_falloff = (_mean(found, "recovered", f"{key}_injected") for key in keys)
 
     def within(name: str) -> str:
         if any(name not in row["errors"] for row in found):
@@ -113,6 +120,7 @@ def _recovered(label: str, rows: Sequence[Row]) -> list[str]:
         return ", ".join(f"{100 * _mean(found, 'errors', name, f'within_{count}'):.0f} %" for count in (1, 2))
 
     cells = [label, f"{stops:+.2f}", f"{0.0 - should:+.2f}", f"{spread:.2f}", f"{injected:.2f}"]
+    cells += [f"{abs(falloff):.1f}", f"{true_falloff:.1f}"]
     return [
         *cells,
         *map(within, ("base_color", "base_color_scaled", "roughness")),

@@ -52,7 +52,7 @@ def test_several_flaws_have_a_row_of_few_words():
         {"case": {"capture": capture, "flaw": flaw, "size": 1.0}, "scores": scores, "named": {}, "beside": []}
         for capture, flaw in cases
     ]
-    labels = [row[0] for row in tables_flaws.scores({"rows": rows})[1:]]
+    labels = [row[0] for row in tables_flaws.scores(rows)[1:]]
     assert labels == [FLAWS["masks"], "noise, masks and poses at once"]
 
 
@@ -154,7 +154,7 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
 
     rows = [row("noise", 29.0), row("clean", 30.0, beside=["few-cameras in frame 0"])]
     rows += [row("masks", 20.0 + 2 * seed, seed, named={"masks": bool(seed)}) for seed in (0, 1)]
-    head, *body = tables_flaws.scores({"rows": rows})
+    head, *body = tables_flaws.scores(rows)
     assert {len(cells) for cells in body} == {len(head)}
     assert [cells[1] for cells in body] == ["30.0 dB / 0.900", "21.0 dB / 0.900", "29.0 dB / 0.900"]
     assert [cells[-1] for cells in body] == ["also `few-cameras`", "masks in 1 of 2 runs", ""]
