@@ -1,10 +1,12 @@
 /**
- * Reader of the delivery container b4d in plain JavaScript: typed arrays, fetch, DecompressionStream and crypto.subtle.
+ * Reader of the delivery container b4d in plain JavaScript: typed arrays, fetch and crypto.subtle.
  * docs/delivery.md specifies the container. Arrays are planar: all x, then all y, then all z.
  *
  *     const take = await Take.open("person.b4d");
  *     const frame = await take.frame(12);  // {positions: Float32Array(3 N), orientations: Float32Array(4 N), ...}
  */
+
+import {inflating} from "./inflate.js";
 
 const HEAD_BYTES = 2 ** 16, MAX_MANIFEST_BYTES = 2 ** 26, FREE_BYTES = 2 ** 24, MAX_RATIO = 64, FREE_COUNT = 2 ** 18, MAX_FRAMES = 30;
 const COMPONENTS = {positions: 3, orientations: 3, turns: 3, scales: 3, opacities: 1, base_color: 3, roughness: 1, ambient_occlusion: 1, normals: 3};
@@ -36,7 +38,7 @@ export class Take {
    *     range of the file (name null) or of a file beside the manifest; by default with fetch.
    */
   static async open(url, read = rangesOf(url)) {
-    const take = Object.assign(new Take(), {read, isArchive: !url.endsWith(".json"), start: 0});
+    const take = Object.assign(new Take(), {read, isArchive: !url.endsWith(".json"), start: 0, unpack: unpacking()});
     let content = await read(null, 0, HEAD_BYTES);
     if (take.isArchive) {
       const head = new DataView(content.buffer, content.byteOffset, content.byteLength);
@@ -70,7 +72,7 @@ export class Take {
    * @param {AbortSignal} [signal] Ends the request early.
    * @param {{packed: Uint8Array}} [held] Keeps the bytes; no request is made for those that it has.
    */
-  async tracks(entry, frames, unpack = unpacking(), signal = undefined, held = {}) {
+  async tracks(entry, frames, unpack = this.unpack, signal = undefined, held = {}) {
     const [name, start] = this.isArchive ? [null, this.start + entry.offset] : [entry.file, 0];
     held.packed ??= await this.read(name, start, entry.bytes, signal);
     const {tracks} = await unpack({packed: held.packed, entry, frames, count: this.manifest.count}).catch((error) => { throw new DeliveryError(error.message); });
@@ -80,16 +82,20 @@ export class Take {
 
   /**
    * Return a frame; its segment is fetched if it is not the one of the last call, and of its planes those are unpacked that
-   * the frame needs, if they have not been.
+   * the frame needs. Summed planes are kept for the next frame.
    * @param {number} number
    * @param {object} [into] As for `frameOf`.
    */
   async frame(number, into = {}) {
     whole(number, "frame", 0, this.manifest.frames - 1);
     const entry = this.manifest.segments.find(({first, frames}) => number < first + frames), frame = number - entry.first;
-    const held = this.held?.entry === entry ? this.held : {entry}, unpack = (block) => unpacking()({...block, frame, tracks: held.tracks});
-    this.held = Object.assign(held, {tracks: await this.tracks(entry, entry.frames, unpack, undefined, held)});
-    return this.frameOf(held.tracks, frame, into);
+    const held = this.held?.entry === entry ? this.held : {entry};
+    // Summed planes of the segment before give their memory. Calls that overlap do not meet: nothing else runs from the first `row` to `use`.
+    const row = () => this.held !== held && this.held?.entry.parts && Object.values(this.held.tracks).flat().find(({planes, first}) => planes.splice(first) && planes.length)?.planes.pop();
+    const use = (tracks) => { found = this.frameOf(tracks, frame, into), this.held = Object.assign(held, {tracks}); };
+    let found;
+    await this.tracks(entry, entry.frames, (block) => this.unpack({...block, frame, tracks: held.tracks, row, use}), undefined, held);
+    return found;
   }
 
   /**
@@ -127,29 +133,16 @@ function check(said) {
 
 /**
  * Return the function that unpacks a block, given its bytes, its entry in the manifest, its number of frames, and of
- * Gaussians; with a `frame`, only the planes that it needs, where the block has parts, beside those in `tracks`, which an
- * earlier call gave. A worker can run this one: it uses nothing outside of itself. `transfer` lists the memory of the answer.
+ * Gaussians. With a `frame`, only the planes that it needs, where the block has parts, beside those in `tracks`, which an
+ * earlier call gave. Then `use` is called with the tracks before the next call writes over their octets, and `row` may give memory.
+ * A worker can run this one: it uses nothing outside of itself and of `inflating`. `transfer` lists the memory of the answer.
  */
-export function unpacking() {
-  const zlib = globalThis.process?.getBuiltinModule?.("node:zlib"); // its streams unpack the same, and slower
+export function unpacking({inflate, inflated, SPARE} = inflating()) {
   const must = (condition, contract, got) => { if (!condition) throw new Error(`${contract}, got ${String(JSON.stringify(got)).slice(0, 80)}.`); };
 
-  /** Put 0, -1, 1, -2, 2 … where octets 0, 1, 2, 3, 4 … stand: four words at a time, but for those before and after. */
-  function signed({buffer, byteOffset, length}) {
-    const head = Math.min(-byteOffset & 3, length), tail = length - ((length - head) & 15), numbers = new Int8Array(buffer, byteOffset, length);
-    const words = new Int32Array(buffer, byteOffset + head, (tail - head) / 4), change = (w) => ((w >>> 1) & 0x7f7f7f7f) ^ Math.imul(255, w & 0x01010101);
-    for (let k = 0; k < words.length; k = k + 4 | 0) {
-      const l = k + 1 | 0, m = k + 2 | 0, n = k + 3 | 0;
-      words[k] = change(words[k]), words[l] = change(words[l]), words[m] = change(words[m]), words[n] = change(words[n]);
-    }
-    for (let i = head ? 0 : tail; i < length; i = i + 1 === head ? tail : i + 1) numbers[i] = change(numbers[i] & 255);
-    return numbers;
-  }
-
-  /** Return the whole numbers of a plane, in its own place if they are octets. */
-  function plane(octets, count, size, isSummed) {
-    if (size === 1 && !isSummed) return signed(octets);
-    const numbers = new Float32Array(count), kept = isSummed ? -1 : 0; // all bits, or none
+  /** Return the whole numbers of a plane. */
+  function plane(octets, count, size, isSummed, row) {
+    const numbers = row?.() || new Float32Array(count), kept = isSummed ? -1 : 0; // all bits, or none
     for (let i = 0, sum = 0; i < count; i = i + 1 | 0) {
       const code = octets[i] | (size > 1 ? octets[count + i | 0] << 8 : 0) | (size > 2 ? octets[2 * count + i | 0] << 16 : 0) | (size > 3 ? octets[3 * count + i | 0] << 24 : 0);
       numbers[i] = sum = (sum & kept) + (code >>> 1 ^ -(code & 1)) | 0;
@@ -170,39 +163,36 @@ export function unpacking() {
     return {tracks, at};
   }
 
-  /** Return what pieces of a stream unpack to; an error if it is damaged, or longer than it may be. */
-  async function inflated(pieces, most, isRaw) {
-    if (zlib) return new Promise((resolve, reject) => zlib[isRaw ? "inflateRaw" : "inflate"](Buffer.concat(pieces), {chunkSize: most + 4096, maxOutputLength: most + 1},
-      (error, {buffer, byteOffset, length} = {}) => (error ? reject(error) : resolve(new Uint8Array(buffer, byteOffset, length)))));
-    const stream = new DecompressionStream(isRaw ? "deflate-raw" : "deflate"), writer = stream.writable.getWriter(), reader = stream.readable.getReader();
-    Promise.all([...pieces.map((piece) => writer.write(piece)), writer.close()]).catch(() => {}); // the reader meets it too
-    let content = new Uint8Array(most), end = 0;
-    for (let part; !(part = await reader.read()).done; end += part.value.length) content.set(part.value, end);
-    return content.subarray(0, end);
-  }
-
-  return async ({packed, entry: {file, bytes, unpacked, sha256, parts}, frames, count, frame, tracks}) => {
+  let octets = new Uint8Array(0); // those that one frame needs
+  return async ({packed, entry: {file, bytes, unpacked, sha256, parts}, frames, count, frame, tracks, row, use}) => {
     must(packed.length === bytes, `${file} must have ${bytes} bytes`, packed.length);
     const digest = !tracks && await globalThis.crypto?.subtle?.digest("SHA-256", packed); // pages from http have none
     const digits = digest ? Array.from(new Uint8Array(digest), (byte) => byte.toString(16).padStart(2, "0")).join("") : sha256;
     must(digits === sha256, `${file} must have the digest that the manifest says`, digits);
     try {
-      const isWhole = !parts || frame === undefined, end = Uint8Array.of(3, 0), wanted = [];
-      let content, at, start = parts?.[0], part = 0;
+      const wanted = [], isAll = !parts || frame === undefined;
+      let content, at = 0, start = parts ? parts[0] : bytes, part = 0;
       if (!tracks) {
-        content = await (isWhole ? inflated([packed], unpacked) : inflated([packed.subarray(2, start), end], unpacked, true));
+        content = inflated(packed, 2, start, unpacked);
         ({tracks, at} = described(content, frames, count, unpacked));
       }
       const components = Object.values(tracks).flat();
       for (const {sizes, first, columns, weights, planes} of components) sizes.forEach((size, k) => {
-        must(isWhole || parts[++part] > 0, "parts must be as many as planes", parts?.[part]);
-        const piece = isWhole ? null : packed.subarray(start, start += parts[part]), isSummed = k < first;
-        if (!planes[k] && (isWhole || isSummed || weights[frame * columns + 1 + k])) wanted.push({piece, planes, k, size, isSummed});
+        must(!parts || parts[++part] > 0, "parts must be as many as planes", parts?.[part]);
+        const from = start, to = start += parts?.[part] ?? 0, isSummed = k < first, isPlain = size === 1 && !isSummed, isNeeded = isAll || isSummed || weights[frame * columns + 1 + k];
+        if (isNeeded && (!planes[k] || isPlain && !isAll)) wanted.push({planes, k, size, isSummed, isPlain, from, to});
       });
-      const sum = wanted.reduce((before, {size}) => before + size * count, 0);
-      if (!isWhole) [content, at] = [await inflated([...wanted.map(({piece}) => piece), end], sum, true), 0];
-      must(!wanted.length || content.length === at + sum, "planes must be as long as they say", content?.length);
-      for (const {planes, k, size, isSummed} of wanted) planes[k] = plane(content.subarray(at, at += size * count), count, size, isSummed);
+      const room = count * (4 + wanted.filter(({isPlain}) => isPlain).length) + SPARE; // plain octets stay; other planes only pass through
+      if (parts) content = isAll ? new Uint8Array(room) : octets.length < room ? octets = new Uint8Array(room) : octets, at = 0;
+      for (const {planes, k, size, isSummed, isPlain, from, to} of wanted) {
+        const most = size * count, codes = content.subarray(at, at + most);
+        const length = parts ? inflate(packed, from, to, content.subarray(at, at + most + SPARE), isPlain) : codes.length;
+        must(length === most, "planes must be as long as they say", length);
+        planes[k] = isPlain ? new Int8Array(content.buffer, at, count) : plane(codes, count, size, isSummed, row);
+        if (isPlain && !parts) for (let i = 0; i < count; i++) codes[i] = codes[i] >> 1 ^ -(codes[i] & 1);
+        if (isPlain || !parts) at += most;
+      }
+      use?.(tracks);
       return {tracks, transfer: [...new Set(components.flatMap(({planes}) => planes.map(({buffer}) => buffer)))]};
     } catch (error) {
       throw new Error(`${file} must be a sound block, got: ${error.message}`);
@@ -217,24 +207,36 @@ function valuesAt(track, frame, none, start, values) {
     const part = (all) => all.subarray(c * count, (c + 1) * count), out = part(values), at = frame * columns;
     const [wide, octets] = [Float32Array, Int8Array].map((kind) => planes.flatMap((row, k) => (row instanceof kind && weights[at + 1 + k] ? [[row, weights[at + 1 + k]]] : [])));
     if (start) wide.unshift([part(start), 1]);
-    const next = () => wide.shift() ?? [none, 0]; // a row and its weight
-    putSum(out, weights[at], ...(octets.shift() ?? [new Int8Array(none.buffer), 0]), ...next(), ...next());
-    for (const octet of octets) putSum(out, 0, ...octet, out, 1, ...next());
+    const next = () => wide.shift() ?? [none, 0], isOdd = wide.length > 2 && wide.length & 1; // a row and its weight
+    (isOdd ? putThree : putTwo)(out, weights[at], ...(octets.shift() ?? [new Int8Array(none.buffer), 0]), ...next(), ...next(), ...(isOdd ? next() : []));
+    for (const octet of octets) putTwo(out, 0, ...octet, out, 1, ...next());
     while (wide.length) addTwo(out, ...next(), ...next());
   });
   return values;
 }
 
 /** Put an offset, weighted octets and two weighted rows; eight numbers at a time, because the loop itself costs much of such a sum. */
-function putSum(out, offset, o, w, a, p, b, q) {
+function putTwo(out, offset, o, w, a, p, b, q) {
   let i = 0, count = out.length;
   for (; i < (count & 7); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i];
   for (; i < count; i = i + 8 | 0) {
     const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
-    out[i] = offset + w * o[i] + p * a[i] + q * b[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j];
-    out[k] = offset + w * o[k] + p * a[k] + q * b[k], out[l] = offset + w * o[l] + p * a[l] + q * b[l];
-    out[m] = offset + w * o[m] + p * a[m] + q * b[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n];
+    out[i] = offset + w * o[i] + p * a[i] + q * b[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j], out[k] = offset + w * o[k] + p * a[k] + q * b[k];
+    out[l] = offset + w * o[l] + p * a[l] + q * b[l], out[m] = offset + w * o[m] + p * a[m] + q * b[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n];
     out[r] = offset + w * o[r] + p * a[r] + q * b[r], out[s] = offset + w * o[s] + p * a[s] + q * b[s];
+  }
+}
+
+/** The same with three weighted rows. */
+function putThree(out, offset, o, w, a, p, b, q, c, z) {
+  let i = 0, count = out.length;
+  for (; i < (count & 7); i++) out[i] = offset + w * o[i] + p * a[i] + q * b[i] + z * c[i];
+  for (; i < count; i = i + 8 | 0) {
+    const j = i + 1 | 0, k = i + 2 | 0, l = i + 3 | 0, m = i + 4 | 0, n = i + 5 | 0, r = i + 6 | 0, s = i + 7 | 0;
+    out[i] = offset + w * o[i] + p * a[i] + q * b[i] + z * c[i], out[j] = offset + w * o[j] + p * a[j] + q * b[j] + z * c[j];
+    out[k] = offset + w * o[k] + p * a[k] + q * b[k] + z * c[k], out[l] = offset + w * o[l] + p * a[l] + q * b[l] + z * c[l];
+    out[m] = offset + w * o[m] + p * a[m] + q * b[m] + z * c[m], out[n] = offset + w * o[n] + p * a[n] + q * b[n] + z * c[n];
+    out[r] = offset + w * o[r] + p * a[r] + q * b[r] + z * c[r], out[s] = offset + w * o[s] + p * a[s] + q * b[s] + z * c[s];
   }
 }
 

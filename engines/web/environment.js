@@ -322,17 +322,17 @@ export function prefilterWorker() {
  * Run a function that returns a handler in a worker, or here if workers are refused; returns {ask(message), end()}. Memory
  * that an answer lists as `transfer` is handed over, not copied.
  */
-export function inWorker(maker) {
+export function inWorker(maker, ...needed) {
   let worker;
   try {
-    const source = `const handle = (${maker})(); onmessage = async ({data: [number, message]}) => {
+    const source = `const handle = (${maker})(${needed.map((each) => `(${each})()`)}); onmessage = async ({data: [number, message]}) => {
       try { const answer = await handle(message); postMessage([number, answer], answer?.transfer ?? []); }
       catch (error) { postMessage([number, null, String(error?.message || error)]); } };`;
     const url = URL.createObjectURL(new Blob([source], {type: "text/javascript"}));
     worker = new Worker(url);
     URL.revokeObjectURL(url);
   } catch { // a page's policy
-    const handle = maker();
+    const handle = maker(...needed.map((each) => each()));
     return {ask: async (message) => handle(message), end() {}};
   }
   const waiting = new Map();

@@ -7,6 +7,7 @@
 
 import {unpacking} from "./b4d.js";
 import {inWorker} from "./environment.js";
+import {inflating} from "./inflate.js";
 
 const RETRY_MS = 2000, MOST_LOADING = 3;
 
@@ -25,7 +26,7 @@ export class Segments {
    *     `tell(type, detail)` says what has stalled, and what has resumed.
    * @param {{ask: Function, end: Function}} [worker] What unpacks blocks.
    */
-  constructor(take, owner, worker = inWorker(unpacking)) {
+  constructor(take, owner, worker = inWorker(unpacking, inflating)) {
     this.#worker = worker;
     Object.assign(this, {take, ...owner, count: take.manifest.segments.length});
   }

@@ -4,6 +4,7 @@ import {Take} from "../../../engines/web/b4d.js";
 import {Environment, prefilterWorker, readHdr} from "../../../engines/web/environment.js";
 import {checkedLights, lampNumbers, mapNumbers, shadowViews} from "../../../engines/web/lights.js";
 import {sortingWorker} from "../../../engines/web/sorting.js";
+import {inflating} from "../../../engines/web/inflate.js";
 import {Segments} from "../../../engines/web/segments.js";
 import {toWgsl} from "../../../engines/web/gpu.js";
 
@@ -43,6 +44,18 @@ const jobs = {
     const at = {frame: "0", segment: 0, heads: [0, 0, 0], terms: [[[0, weight]], [], []]};
     const {orders, bulk} = handle({at, views: rows, bulk: true});
     return {orders: orders.map((order) => Array.from(order.subarray(0, count))), bulk};
+  },
+  /** Return what streams unpack to, null where they are damaged; throws if signed octets are others. */
+  inflate: ({streams}) => {
+    const {inflate, inflated, SPARE} = inflating();
+    return streams.map(([text, end, most]) => {
+      const packed = Buffer.from(text, "base64"), room = new Uint8Array(most + SPARE);
+      let octets;
+      try { octets = inflated(packed, 0, end, most); } catch { return null; }
+      const count = inflate(packed, 0, end, room, true), signed = new Int8Array(room.buffer, 0, count);
+      if (count !== octets.length || signed.some((number, i) => number !== (octets[i] & 1 ? -(octets[i] + 1) / 2 : octets[i] / 2))) throw new Error("signed");
+      return Buffer.from(octets).toString("base64");
+    });
   },
   take: async ({path}) => {
     const bytes = readFileSync(path), take = await Take.from(bytes);

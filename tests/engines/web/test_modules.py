@@ -1,5 +1,6 @@
 """What the web module computes without a GPU: the same numbers as Python, and words for what is wrong."""
 
+import base64
 import gzip
 import json
 import re
@@ -7,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -171,6 +173,64 @@ def test_depth_order_is_that_of_the_rasteriser_and_the_subject_s_bulk_that_of_py
     center = 0.5 * (points.min(axis=0) + points.max(axis=0))
     assert found["bulk"]["center"] == pytest.approx(center, abs=1e-5)
     assert found["bulk"]["radius"] == pytest.approx(np.linalg.norm(points - center, axis=1).max(), rel=1e-5)
+
+
+def packed(content, level=9, strategy=zlib.Z_DEFAULT_STRATEGY):
+    """Raw deflate."""
+    stream = zlib.compressobj(level, zlib.DEFLATED, -15, 9, strategy)
+    return stream.compress(content) + stream.flush()
+
+
+def unpacked(stream, most):
+    """What zlib makes of raw deflate; None if that is damaged, or longer than ``most``."""
+    unpacking = zlib.decompressobj(-15)
+    try:
+        content = unpacking.decompress(stream, most + 1)
+    except zlib.error:
+        return None
+    return content if unpacking.eof and len(content) <= most else None
+
+
+@needs_node
+def test_deflate_is_unpacked_as_zlib_does():
+    """Every kind of block, codes of every length, distances that are near and far; and streams that are damaged."""
+    rng = np.random.default_rng(3)
+    rare = np.repeat(np.arange(24), 2 ** np.arange(24)[::-1] // 8 + 1)[: 2**18]  # codes of up to 15 bits
+    near = b"".join(bytes([k]) * 9 + bytes([k, k + 1] * 9) + bytes([k, k + 1, k + 2] * 9) for k in range(200))
+    noise = rng.integers(0, 256, 40_000, np.uint8).tobytes()
+    repeated = bytearray(noise)
+    for start, length in zip(rng.geometric(0.001, 4000), rng.integers(3, 300, 4000), strict=True):
+        repeated += repeated[-start:][:length] + bytes([length % 256])
+    sparse = rng.poisson(0.05, 60_000).astype(np.uint8).tobytes()
+    contents = [
+        b"",
+        b"a",
+        bytes(10**5),
+        rng.permutation(rare).astype(np.uint8).tobytes(),
+        near,
+        noise,
+        bytes(repeated),
+        sparse,
+    ]
+    strategies = [zlib.Z_DEFAULT_STRATEGY, zlib.Z_FIXED, zlib.Z_HUFFMAN_ONLY, zlib.Z_RLE]
+    sound = [(packed(content, 9, how), len(content)) for content in contents for how in strategies]
+    sound += [(packed(content, level), len(content)) for content in contents for level in (0, 1)]
+    small = [(packed(content[:3000], 9, how), len(content[:3000])) for content in contents for how in strategies]
+    damaged = []
+    for stream, most in small:
+        for at in rng.integers(1, len(stream), 40):
+            spoiled = bytearray(stream)
+            spoiled[at] ^= 1 << rng.integers(8)
+            damaged += [(bytes(spoiled), most), (stream[:at], most)]
+        damaged.append((stream, most - 1))
+    streams = sound + damaged
+    jobs = [[base64.b64encode(stream + bytes(4)).decode(), len(stream), max(most, 0)] for stream, most in streams]
+    (found,) = run({"job": "inflate", "streams": jobs})
+    for (stream, most), theirs in zip(streams, found, strict=True):
+        ours = unpacked(stream, max(most, 0))
+        assert ours == (None if theirs is None else base64.b64decode(theirs)), (stream[:40], most)
+    assert None not in found[: len(sound)]
+    assert None in found
 
 
 @needs_node

@@ -208,6 +208,8 @@ def picture_of(page):
     return np.asarray(Image.open(BytesIO(page.locator("#canvas").screenshot())).convert("RGB"))
 
 
+BOUND = "inflate b4d gpu environment lights sorting segments shaders shading relight index"
+"""Modules, each after those that it names."""
 FILE_PAGE = """<!doctype html><script>
 const sources = SOURCES, places = {};
 for (const [name, text] of Object.entries(sources)) {
@@ -229,8 +231,7 @@ window.played = (async () => {
 
 
 def test_a_page_from_a_file_plays_a_take_from_its_bytes(browser, take, tmp_path):
-    order = ("b4d", "gpu", "environment", "lights", "sorting", "segments", "shaders", "shading", "relight", "index")
-    sources = json.dumps({name: (MODULE / f"{name}.js").read_text(encoding="utf-8") for name in order})
+    sources = json.dumps({name: (MODULE / f"{name}.js").read_text(encoding="utf-8") for name in BOUND.split()})
     text = FILE_PAGE.replace("BYTES", base64.b64encode(take.read_bytes()).decode()).replace("PRELUDE", PRELUDE)
     file = tmp_path / "page.html"
     file.write_text(text.replace("SOURCES", sources.replace("</", "<\\/")), encoding="utf-8")
