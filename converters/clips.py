@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, reduce
 from operator import add
 from pathlib import Path
@@ -48,6 +48,7 @@ class ClipWork:
         numbers: What the frames are called.
         shared: Arrays that are the same in all frames if the topology is constant: because the sequence states it, or
             the frames turn out to have the same identities. None where it cannot be.
+        options: How the asset is written. One with keys has no steps: what varies is told beside its first frame.
     """
 
     folder: Path
@@ -56,10 +57,11 @@ class ClipWork:
     makers: Sequence[tuple[str, ...]]
     numbers: Sequence[int]
     shared: frozenset[str] | None = None
+    options: WriteOptions = field(default_factory=WriteOptions)
 
     def plan(self) -> Plan:
-        """Return the steps; none for a sequence that is written without clips."""
-        if len(self.makers) <= MAX_FRAMES_IN_ONE_LAYER:
+        """Return the steps; none for a sequence that is written without clips, or with keys."""
+        if len(self.makers) <= MAX_FRAMES_IN_ONE_LAYER or self.options.keyed:
             return Plan(self.folder, (), {})
         (self.folder / FOLDER).mkdir(parents=True, exist_ok=True)
         parts, clips = list[Step](), list[Step]()
@@ -81,7 +83,7 @@ class ClipWork:
 
         known = receipts.get(self._whole)
         clips = None if known is None else WrittenClips(_survey_of(known.facts["survey"]), self.folder / FOLDER)
-        return usd.write(sequence, path, WriteOptions(), clips)
+        return usd.write(sequence, path, self.options, clips)
 
     @property
     def _survey(self) -> str:

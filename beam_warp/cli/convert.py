@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 from beam_warp import __version__, converters
 from beam_warp.checks import require_path
 from beam_warp.cli.common.console import escaped, options_named, print_json, print_notes, progress, run_command
-from beam_warp.cli.common.flags import Json, MetersPerUnit, Quiet, SourceAxes, notes_of, options_of
+from beam_warp.cli.common.flags import Json, Keyed, MetersPerUnit, Quiet, SourceAxes, notes_of, options_of
 from beam_warp.cli.common.pages import parse
 from beam_warp.cli.common.paths import paths_checked
 from beam_warp.converters.common.importers import IMPORTERS
@@ -81,7 +81,7 @@ class ConvertCommand:
     lighting_variants: Annotated[
         bool, arg(help="USD: add a variant whose radiance is the base colour, for renderers that light it.")
     ] = False
-    keyed: Annotated[bool, arg(help="USD: time samples only where frames between them are not within bounds.")] = False
+    keyed: Keyed = False
     error_scale: Annotated[float, arg(metavar="X", help="b4d, and USD with --keyed: multiply all bounds.")] = 1.0
     player: Annotated[bool, arg(help="Write a page, OUT.html, that plays the asset in any browser.")] = False
     environment: Annotated[

@@ -14,7 +14,7 @@ from beam_warp import converters
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_number, require_path
 from beam_warp.cli.common.console import print_json, print_notes, progress
-from beam_warp.cli.common.flags import Device, DropInvalid, Json, MetersPerUnit, Quiet, Seed, SourceAxes, Workers
+from beam_warp.cli.common.flags import Device, DropInvalid, Json, Keyed, MetersPerUnit, Quiet, Seed, SourceAxes, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.cli.common.targets import TargetFlags
 from beam_warp.cli.decompose import (
@@ -82,6 +82,8 @@ class Run:
         bool, arg(help="Row i is the same Gaussian in every frame: fit over all frames."), SECOND_PAGE
     ] = False
     fps: Annotated[float | None, arg(metavar="RATE", help="Frames per second; else the input's word, else 30.")] = None
+    keyed: Annotated[Keyed, SECOND_PAGE] = False
+    error_scale: Annotated[float, arg(metavar="X", help="With --keyed: multiply all bounds."), SECOND_PAGE] = 1.0
     workers: Workers = "1"
     seed: Seed = 0
     drop_invalid: Annotated[DropInvalid, SECOND_PAGE] = False
@@ -95,6 +97,7 @@ def run(args: Run) -> int:
     started = time.perf_counter()
     capture = capture_at(args.input)
     _check_words(args, capture)
+    written = converters.WriteOptions(keyed=args.keyed, error_scale=args.error_scale)
     light = light_of(args.measuring, capture, args.input)
     crew = crew_of(args.workers, args.device, STEP_MODULES)
     environment = EnvironmentMap.read(light).rotated(args.measuring.rotate)
@@ -126,7 +129,7 @@ def run(args: Run) -> int:
                 source = Piloted(given.sequence, None, environment, options_for)
                 chosen = rays_for(target, args.measuring, source, len(given.numbers()), started)
                 options = options_for(with_rays(args.measuring, chosen))
-            work = MaterialWork(require_path("out", args.out), given, environment, options, report)
+            work = MaterialWork(require_path("out", args.out), given, environment, options, report, written)
             result, reconstruction = run_materials(work, view, started, crew), None
         else:
             modelling = _modelling(args, capture, environment, started)
@@ -138,7 +141,8 @@ def run(args: Run) -> int:
                 source = Piloted(lambda: found.sequence, found.capture, environment, options_for)
                 chosen = rays_for(target, args.measuring, source, len(found.sequence), started)
                 options = options_for(with_rays(args.measuring, chosen))
-            work = MaterialWork(args.out, ReconstructedFrames(frames, args.fps), environment, options, report)
+            made = ReconstructedFrames(frames, args.fps)
+            work = MaterialWork(args.out, made, environment, options, report, written)
             both = run_capture(frames, work, view, started, crew)
             result, reconstruction = both.result, both.reconstruction.report
     if target is not None and chosen is not None:
@@ -172,6 +176,10 @@ def _check_words(args: Run, capture: Capture | None) -> None:
         raise InvalidOptionError(
             "gaussians, preset, segment-length, seam-frames, cameras, masks, exposures and frames must be left out "
             f"unless the input is a capture, got {args.input}. Drop them."
+        )
+    if args.error_scale != 1.0 and not args.keyed:
+        raise InvalidOptionError(
+            f"error-scale must be left out without keyed, got {args.error_scale:g}, which nothing goes by. Add --keyed."
         )
     of_files = (args.source_axes, args.meters_per_unit, args.drop_invalid or None, args.persistent or None)
     if capture is not None and any(value is not None for value in of_files):

@@ -7,7 +7,7 @@ import json
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.digests import CaptureDigests
 from beam_warp.converters.clips import ClipWork
+from beam_warp.converters.common.options import WriteOptions
 from beam_warp.converters.numbering import ASSET_NAME
 from beam_warp.decomposition.archive import FrameArchive
 from beam_warp.decomposition.capture_images import CaptureImages
@@ -63,6 +64,7 @@ class MaterialWork:
         environment: The light as it was given.
         options: How frames are measured.
         progress: Told how far a step is, in the process that this is made in.
+        written: How the asset is written.
     """
 
     folder: Path
@@ -70,18 +72,25 @@ class MaterialWork:
     environment: EnvironmentMap
     options: RunOptions
     progress: NotedProgress = no_progress
+    written: WriteOptions = field(default_factory=WriteOptions)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what other processes need: nothing that was read, and nobody who hears them."""
-        return {**{field.name: vars(self)[field.name] for field in fields(self)}, "progress": no_progress}
+        return {**{own.name: vars(self)[own.name] for own in fields(self)}, "progress": no_progress}
 
     def prepare(self) -> list[str]:
         """Check what can be checked, make the folders and remove what a killed call has left; return notes.
 
         Raises:
-            InvalidOptionError: The capture lacks a frame, or there is none for the image path.
+            InvalidOptionError: The capture lacks a frame, or there is none for the image path; or keys are asked for
+                where rows are not the same Gaussians in every frame.
             OutputError: A folder cannot be made.
         """
+        if self.written.keyed and len(self.frames.numbers()) > 1 and not self._may_be_persistent:
+            raise InvalidOptionError(
+                "keyed must go with frames that have the same Gaussians, got others, whose rows must not be blended. "
+                "Leave it out, or state that rows persist with --persistent."
+            )
         if self.options.images is not None and not self.frames.have_images:
             raise InvalidOptionError(
                 "capture must be given for the image path, got none: it works on images. Pass one, or leave images out."
@@ -118,7 +127,7 @@ class MaterialWork:
         if self._solves_later:
             makers = [(material_step(it), "joint", solution_step(part[0])) for part in self._parts for it in part]
         shared = self.options.shared_roughness if self._may_be_persistent else None
-        return ClipWork(self.folder, ASSET_STEM, self.finished, makers, numbers, shared)
+        return ClipWork(self.folder, ASSET_STEM, self.finished, makers, numbers, shared, self.written)
 
     def finished(self) -> GaussianSequence:
         """Return the frames with base colour, each to be read when it is done; without metadata."""

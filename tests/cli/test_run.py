@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from pxr import Usd
 from support.commands import beam
 from support.shapes import cloud_of, sphere_points, tiles
 
-from beam_warp import GaussianSequence, write
+from beam_warp import GaussianSequence, read, write
 from beam_warp.cli.convert import main as convert
 from beam_warp.cli.run import capture_at
 from beam_warp.cli.validate import main as validate
@@ -75,6 +76,7 @@ def test_run_then_render_then_validate(ball, sky, tmp_path, capsys):
         ("ball.ply --environment sky.exr --fps 0", "--fps must be"),
         ("ball.ply --environment sky.exr --roughness 7", "--roughness must be a number in [0, 1], got 7.0"),
         ("ball.ply --environment sky.exr --roughness r.png --roughness-mesh m.obj", "must be files, got r.png"),
+        ("ball.ply --environment sky.exr --error-scale 2", "error-scale must be left out without keyed, got 2"),
         ("ball.ply --environment sky.exr --offset nan", "--offset must be a number in"),
         ("ball.ply --environment sky.exr --exposure 99", "--exposure must be a number in"),
         ("ball.ply --environment sky.exr --seed -5", "--seed must be an integer in"),
@@ -97,6 +99,21 @@ def test_environment_with_a_bad_texel(ball, tmp_path, refused, value):
     path = environment(tmp_path / "bad.exr", radiance)
     says = "at row 3, column 5 (1 texels in all)"
     refused("run", ball, "--environment", path, "--out", tmp_path / "out", says=says)
+
+
+def test_a_take_with_keys(sky, tmp_path, refused):
+    """What is known to be the same Gaussians may be keyed; without that word nothing is begun."""
+    points, spacing = sphere_points(100)
+    radiance = {"radiance": np.full((100, 1, 3), 0.4), "radiance_color_space": DISPLAY_SRGB}
+    ball = cloud_of(tiles(points, points, spacing), **radiance)
+    moved = [ball.with_arrays(positions=ball.positions + 0.1 * frame) for frame in range(4)]
+    write(GaussianSequence.from_clouds(moved), tmp_path / "take.usdc")
+    words = ("run", tmp_path / "take.usdc", "--environment", sky, "--samples", 4, "--device", "cpu", "--keyed")
+    refused(*words, "--out", tmp_path / "no", says="must go with frames that have the same Gaussians")
+    assert beam(*words, "--persistent", "--error-scale", 2, "--out", tmp_path / "out", "--quiet") == 0
+    stage = Usd.Stage.Open(str(tmp_path / "out" / "asset.usda"))
+    samples = stage.GetPrimAtPath("/Asset/Splats").GetAttribute("positions").GetNumTimeSamples()
+    assert (samples, len(read(tmp_path / "out" / "asset.usda"))) == (2, 4)
 
 
 def test_version(capsys):

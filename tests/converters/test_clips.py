@@ -18,6 +18,7 @@ from beam_warp.plan.workers import InProcess
 from beam_warp.schema.clips import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER
 from beam_warp.world.gaussians import GaussianSequence
 
+PLAIN = converters.WriteOptions()
 COUNT = MAX_FRAMES_IN_ONE_LAYER + CLIP_FRAMES // 2
 
 
@@ -69,15 +70,15 @@ class Made:
         return replace(self.sequence(), constant=frozenset({"ids", "roughness"}), topology="constant")
 
 
-def work(folder, kind):
+def work(folder, kind, options=PLAIN):
     folder.mkdir()
     made, names = Made(folder, kind), [(f"frame-{number}",) for number in range(COUNT)]
     shared = {"same": {"roughness"}, "found": {"roughness"}, "lost": {"roughness"}}.get(kind)
-    return made, ClipWork(folder, "asset", made.sequence, names, range(COUNT), shared and frozenset(shared))
+    return made, ClipWork(folder, "asset", made.sequence, names, range(COUNT), shared and frozenset(shared), options)
 
 
-def written(folder, kind):
-    made, clips = work(folder, kind)
+def written(folder, kind, options=PLAIN):
+    made, clips = work(folder, kind, options)
     steps = [Step(f"frame-{number}", "frame", number) for number in range(COUNT)]
     plan = Plan(folder, tuple(steps), {"frame": made}).with_steps_of(clips.plan())
     receipts = carry_out(plan, here(plan))
@@ -100,6 +101,15 @@ def test_clips_of_steps_have_the_bytes_of_one_call(tmp_path, kind):
     assert layers(tmp_path / "steps") == layers(tmp_path)
     assert len(layers(tmp_path)) == (2 if kind == "still" else 6)
     assert all(receipt.is_kept for receipt in carry_out(plan, here(plan)).values())
+
+
+def test_keys_are_written_when_all_frames_are_made(tmp_path):
+    """Clips with keys are no steps: their survey compares all frames with the first one."""
+    options = converters.WriteOptions(keyed=True, error_scale=2.0)
+    made, receipts, _ = written(tmp_path / "steps", "same", options)
+    converters.write(made.whole(), tmp_path / "asset.usda", options)
+    assert layers(tmp_path / "steps") == layers(tmp_path)
+    assert all(name.startswith("frame") for name in receipts)
 
 
 def test_a_lost_clip_is_written_again_and_nothing_else(tmp_path):

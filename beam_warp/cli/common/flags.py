@@ -36,6 +36,7 @@ DropInvalid = Annotated[bool, arg(help="Leave out rows with NaN or zero quaterni
 Workers = Annotated[
     str, arg(metavar="N|gpus|3@gpus|ray://…", help="Who works: N processes, one (or 3) on each GPU, or a Ray cluster.")
 ]
+Keyed = Annotated[bool, arg(help="USD: time samples only where frames between them are not within bounds.")]
 Seed = Annotated[int, arg(help="Same seed, same device: same result.")]
 Device = Annotated[str | None, arg(help="cpu, cuda:0, …; the first GPU by default, if there is one.")]
 Quiet = Annotated[bool, arg(help="Print nothing but errors.")]
