@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -101,12 +102,15 @@ def require_rows(name: str, value: wp.array, dtype: Any, device: Any) -> wp.arra
     return value
 
 
-def zero_struct(structure: Any, count: int, device: Any) -> Any:
-    """Return a struct of kernels whose one-dimensional arrays have ``count`` rows of zeros on a device."""
+def zero_struct(structure: Any, count: int, device: Any, *, allocate: Callable[..., wp.array] = wp.zeros) -> Any:
+    """Return a struct of kernels whose one-dimensional arrays have ``count`` rows on a device.
+
+    They hold zeros, or anything with `wp.empty` to ``allocate`` them.
+    """
     result = structure()
     for name, variable in structure.vars.items():
         if getattr(variable.type, "ndim", 0) == 1:
-            setattr(result, name, wp.zeros(count, dtype=variable.type.dtype, device=device))
+            setattr(result, name, allocate(count, dtype=variable.type.dtype, device=device))
     return result
 
 

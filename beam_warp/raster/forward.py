@@ -37,7 +37,7 @@ SPARE_CAPACITY = 1.25
 
 
 def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
-    """Make splats of the Gaussians, their rows of channels and their order in depth."""
+    """Make splats of the Gaussians, and put them in their order in depth."""
     launch_project(gaussians[:4], buffers.views, buffers.projection, buffers.splats, buffers.device)
     if buffers.channels.colors:
         launch_evaluate_colors(
@@ -45,7 +45,6 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
         )
     if buffers.channels.values:
         buffers.blocks.values = gaussians.values
-    gather_channels(buffers)
     launch_key_splats(len(buffers.splats.centers), buffers.splats, buffers.keys, buffers.order.splats, buffers.device)
     if buffers.splat_count:
         wp.utils.radix_sort_pairs(buffers.keys, buffers.order.splats, buffers.splat_count)

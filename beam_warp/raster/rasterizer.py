@@ -164,6 +164,7 @@ class Rasterizer:
         self._gaussians = None  # until all of it is drawn: a frame that is refused cannot be drawn again
         with wp.ScopedDevice(self.device):
             forward.project(self._buffers, gaussians)
+            forward.gather_channels(self._buffers)
             self._bands = forward.plan_bands(self._buffers)
             for band in self._bands:
                 if len(self._bands) > 1:
@@ -182,15 +183,23 @@ class Rasterizer:
         Raises:
             InvalidOptionError: Nothing was drawn.
         """
+        self.relist()
+        return self.redraw_values()
+
+    def relist(self) -> None:
+        """Find the splats of every tile again, without waiting: the part of `redraw` that looks at no values.
+
+        `redraw_values` draws them. A frame of several bands lists each when it draws it.
+
+        Raises:
+            InvalidOptionError: Nothing was drawn.
+        """
         gaussians = self._drawn_gaussians("redraw")
-        if len(self._bands) > 1:
-            return self.draw(gaussians)
-        with wp.ScopedDevice(self.device):
-            forward.project(self._buffers, gaussians)
-            forward.count_pairs(self._buffers, self._bands[0])
-            forward.list_pairs(self._buffers)
-            self._composite()
-        return self.images
+        if self.is_whole:
+            with wp.ScopedDevice(self.device):
+                forward.project(self._buffers, gaussians)
+                forward.count_pairs(self._buffers, self._bands[0])
+                forward.list_pairs(self._buffers)
 
     def redraw_values(self) -> RasterImages:
         """Draw the last frame again after the contents of its values changed and nothing else, without waiting.

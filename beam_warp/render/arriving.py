@@ -57,6 +57,7 @@ class ArrivingLight:
         self._count, self._options, self._environments, self._device = gaussian_count, options, environments, device
         cluster_count = min(CLUSTER_COUNT, gaussian_count)
         with wp.ScopedDevice(device):
+            self._shares = wp.zeros((0, gaussian_count), dtype=float)
             self._arriving = wp.zeros(gaussian_count, dtype=wp.vec4)
             self._lit = wp.zeros(gaussian_count, dtype=wp.vec3)
             self._clusters = zero_struct(Clusters, cluster_count, device)
@@ -108,6 +109,7 @@ class ArrivingLight:
         count = 0 if regions is None else len(regions)
         if self._moments.red is None or len(self._moments.red) != count:
             self._moments = zero_struct(LightMoments, count, self._device)
+            self._shares = wp.zeros((count, self._count), dtype=float, device=self._device)
             self._region_drawer = None
         views = []
         if regions is not None:
@@ -202,9 +204,8 @@ class ArrivingLight:
         """Find the irradiance that reaches the Gaussians."""
         if not self._options.lights_gaussians or not self._count:
             return
-        launch_light_gaussians(
-            self._clusters.order, gaussians, self.scene_light(), self._arriving, self._lit, self._device
-        )
+        arrays = (self._shares, self._arriving, self._lit)
+        launch_light_gaussians(self._clusters.order, gaussians, self.scene_light(), *arrays, self._device)
         radiosity = self._bounced(gaussians) if self._options.bounces else self._no_radiosity
         launch_gather_bounces(
             len(gaussians.positions),

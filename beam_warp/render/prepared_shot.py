@@ -69,6 +69,7 @@ class DeferredFrame:
         """Allocate for shots of as many Gaussians and pixels, and `set` this one."""
         self._options, self._device = options, device
         self._graphs = StepGraphs(device)
+        self._beside = wp.Stream(device) if device.is_cuda else None
         self._recorded: Any = None
         self._count = len(shot.cloud)
         self._size = (shot.camera.width, shot.camera.height)
@@ -181,9 +182,14 @@ class DeferredFrame:
             self._recorded = given
 
     def _redraw(self) -> None:
-        """Take every step of a frame."""
+        """Take every step of a frame; the view's splats are listed beside the shadow maps: neither fills a GPU."""
+        with wp.ScopedStream(self._beside):
+            self._rasterizer.relist()
         self._light.redraw(self.gaussians)
-        self._redraw_view()
+        if self._beside is not None:
+            wp.wait_stream(self._beside)
+        self._rasterizer.redraw_values()
+        self._shade()
 
     def _redraw_view(self) -> None:
         """Take the steps that depend on the camera."""

@@ -99,7 +99,7 @@ def closest_surface(
         require_same_length("attributes", values, "the scene", len(scene))
         require_finite("attributes", values)
     count = len(starts)
-    records = zero_struct(SurfaceRecords, count, device)
+    records = zero_struct(SurfaceRecords, count, device, allocate=wp.empty)
     records.attributes = wp.empty((count, values.shape[1]), dtype=float, device=device)
     launch_trace_surface(
         len(starts),

@@ -15,7 +15,7 @@ from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.trace.bounds import INVISIBLE, NOT_FINITE, RAISED, TRACED
 from beam_warp.kernels.trace.occluders import GaussianAndMeshOccluders, GaussianOccluders
 from beam_warp.trace.packing import PackedGaussians
-from beam_warp.trace.wide_tree import BuiltTree, build_wide_tree, refit
+from beam_warp.trace.wide_tree import BuiltTree, RepeatedBuild, build_wide_tree, refit
 from beam_warp.world.gaussians import GaussianCloud
 
 NOTHING = GaussianCloud(
@@ -69,6 +69,7 @@ class Scene:
     _tree: BuiltTree = field(repr=False, init=False)
     _report: SceneReport = field(repr=False, default=SceneReport(0, 0, 0))
     _refitted: bool = field(repr=False, default=False)
+    _repeated: RepeatedBuild | None = field(repr=False, default=None)
 
     @classmethod
     def from_gaussians(
@@ -215,6 +216,8 @@ class Scene:
             return
         self.packed.place(*arrays)
         self._refitted = tree == "refit"
+        if tree == "fast" == self._tree.method and self._repeated is None and self._tree.count > 1:
+            self._repeated = RepeatedBuild(self.packed, self._tree)
         if tree != "refit":
             self._build(tree)
         else:
@@ -223,10 +226,16 @@ class Scene:
     def _build(self, build: Build) -> None:
         """Build the hierarchy over the packed bounds, and report."""
         packed = self.packed
+        repeated = self._repeated if build == "fast" else None
+        if repeated is not None:
+            repeated.launch()
         number = packed.fate_counts()
         traced = number[TRACED] + number[RAISED]
-        self._tree = build_wide_tree(packed, traced, build)
-        self.occluders.tree = self._tree.tree
+        built = None if repeated is None else repeated.built(traced)
+        if built is None:
+            built, self._repeated = build_wide_tree(packed, traced, build), None
+        self._tree = built
+        self.occluders.tree = built.tree
         # The one Gaussian of an empty scene is not the cloud's.
         invisible = number[INVISIBLE] if len(self) else 0
         self._report = SceneReport(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 
-from beam_warp.device.morton import morton_order
+from beam_warp.device.graphs import StepGraphs
+from beam_warp.device.morton import MortonOrder, morton_order
 from beam_warp.errors import InvalidArrayError
 from beam_warp.kernels.trace.radix_tree import launch_split_runs
 from beam_warp.kernels.trace.tree_build import (
@@ -33,6 +35,12 @@ REACH = 8
 
 ROUNDS_BY_AREA = 64
 """Rounds of merging by area; after that, what is left pairs up by place, so that no input makes a deep tree."""
+
+SPARE_LEVELS = 2
+"""Levels that the next tree of moved Gaussians may have more than the first one."""
+
+ROOT_ALONE = np.array([1] + [0] * (LARGEST_DEPTH + 2), np.int32)
+"""Nodes of each level, and leaves, before any is opened."""
 
 Method = Literal["quality", "fast", "places"]
 
@@ -87,18 +95,29 @@ def build_wide_tree(packed: PackedGaussians, count: int, method: Method) -> Buil
 
 def refit(built: BuiltTree, packed: PackedGaussians) -> None:
     """Give a tree the boxes and leaves of Gaussians that moved: same tree, exact bounds."""
-    launch_fill_leaves(built.count, packed.gaussians, built.layout, built.tree, packed.device)
-    for begin, count in reversed(built.levels):
-        launch_bound_nodes(count, begin, packed.lowers, packed.uppers, built.layout, built.tree, packed.device)
+    _bound(built.layout, built.tree, built.count, [count for _, count in built.levels], packed)
+
+
+def _bound(layout: WideLayout, tree: WideTree, count: int, widths: Sequence[int], packed: PackedGaussians) -> None:
+    """Write a tree's leaves, and its nodes from the last level up; levels are at most so wide."""
+    launch_fill_leaves(count, packed.gaussians, layout, tree, packed.device)
+    for level, width in reversed(list(enumerate(widths))):
+        launch_bound_nodes(width, level, packed.lowers, packed.uppers, layout, tree, packed.device)
 
 
 def _split(keys: wp.array, count: int, device: Any) -> tuple[BinaryTree, int]:
     """Return the binary tree of sorted codes, without boxes, and its root."""
+    binary = _binary_room(count, device)
+    launch_split_runs(count - 1, keys, count, binary, device)
+    return binary, count if count > 1 else 0
+
+
+def _binary_room(count: int, device: Any) -> BinaryTree:
+    """Allocate a binary tree without boxes."""
     binary = BinaryTree()
     for name in ("left", "right", "size"):
         setattr(binary, name, wp.empty(max(2 * count - 1, 1), dtype=int, device=device))
-    launch_split_runs(count - 1, keys, count, binary, device)
-    return binary, count if count > 1 else 0
+    return binary
 
 
 def _merge(packed: PackedGaussians, items: wp.array, count: int, reach: int) -> tuple[BinaryTree, int]:
@@ -123,42 +142,103 @@ def _merge(packed: PackedGaussians, items: wp.array, count: int, reach: int) -> 
 
 def _collapse(binary: BinaryTree, root: int, items: wp.array, count: int, method: Method, device: Any) -> BuiltTree:
     """Open binary nodes to four children, level by level; boxes come with `refit`."""
-    layout, tree = WideLayout(), WideTree()
     binary.items, binary.leaf_count = items, count
     room = max(count, 1)  # a tree has fewer nodes than leaves, and at least its root
-    layout.items = wp.empty(room, dtype=int, device=device)
-    layout.children = wp.zeros(room, dtype=wp.vec4i, device=device)
-    sizes = np.zeros(LARGEST_DEPTH + 3, np.int32)
-    sizes[0] = 1
+    layout = _layout_room(room, device)
     if count:
         # The host learns how many nodes a level has, and when there are none, only now and then: asking takes longer
         # than a level. Until then a launch is as wide as the level can be.
-        level_sizes = wp.array(sizes, dtype=int, device=device)
         queue, following = wp.full(room, root, dtype=int, device=device), wp.empty(room, dtype=int, device=device)
         ask_at = math.ceil(math.log(room, WIDTH)) + 3
         for level in range(LARGEST_DEPTH + 1):
             bound = min(WIDTH**level, room)
             if device.is_cpu or level >= ask_at:
-                sizes = level_sizes.numpy()
-                bound = int(sizes[level])
+                bound = int(layout.level_sizes.numpy()[level])
                 ask_at = level + 3
                 if bound == 0:
                     break
-            launch_open_level(
-                bound, binary, int(method != "fast"), level, queue, level_sizes, following, layout, device
-            )
+            launch_open_level(bound, binary, int(method != "fast"), level, queue, following, layout, device)
             queue, following = following, queue
-        sizes = level_sizes.numpy()
-    used = sizes[: LARGEST_DEPTH + 2]
-    used = used[used > 0].tolist()
-    begins = np.concatenate([[0], np.cumsum(used)]).tolist()
-    if begins[-1] > LARGEST_NODE_COUNT:
+    levels = _levels(layout)
+    node_count = sum(levels[-1])
+    if node_count > LARGEST_NODE_COUNT:
         raise InvalidArrayError(
-            f"cloud must make a tree of at most {LARGEST_NODE_COUNT:,} nodes, got {begins[-1]:,} for {count:,} "
+            f"cloud must make a tree of at most {LARGEST_NODE_COUNT:,} nodes, got {node_count:,} for {count:,} "
             "Gaussians. Split the cloud."
         )
-    layout.lower = wp.empty(begins[-1], dtype=wp.vec3, device=device)
-    layout.upper = wp.empty(begins[-1], dtype=wp.vec3, device=device)
-    tree.nodes = wp.empty(begins[-1] * NODE_ROWS, dtype=wp.vec4i, device=device)
-    tree.leaves = wp.empty(room * LEAF_ROWS, dtype=wp.vec4, device=device)
-    return BuiltTree(tree, method, count, tuple(zip(begins[:-1], used, strict=True)), layout)
+    return BuiltTree(_tree_room(layout, node_count, room, device), method, count, levels, layout)
+
+
+def _layout_room(room: int, device: Any) -> WideLayout:
+    """Allocate who is whose child, for so many leaves; a root is all there is yet."""
+    layout = WideLayout()
+    layout.items = wp.empty(room, dtype=int, device=device)
+    layout.children = wp.zeros(room, dtype=wp.vec4i, device=device)
+    layout.level_sizes = wp.array(ROOT_ALONE, dtype=int, device=device)
+    return layout
+
+
+def _tree_room(layout: WideLayout, nodes: int, leaves: int, device: Any) -> WideTree:
+    """Allocate what `refit` writes: boxes in the layout, and a tree."""
+    tree = WideTree()
+    layout.lower = wp.empty(nodes, dtype=wp.vec3, device=device)
+    layout.upper = wp.empty(nodes, dtype=wp.vec3, device=device)
+    tree.nodes = wp.empty(nodes * NODE_ROWS, dtype=wp.vec4i, device=device)
+    tree.leaves = wp.empty(leaves * LEAF_ROWS, dtype=wp.vec4, device=device)
+    return tree
+
+
+def _levels(layout: WideLayout) -> tuple[tuple[int, int], ...]:
+    """Return (first node, nodes) of each level; waits for the device."""
+    sizes = layout.level_sizes.numpy()[: LARGEST_DEPTH + 2]
+    used = sizes[sizes > 0].tolist()
+    return tuple(zip([0, *np.cumsum(used).tolist()], used, strict=False))
+
+
+class RepeatedBuild:
+    """Fast trees of Gaussians that move: one CUDA graph each, in arrays that stay, and one question to the device.
+
+    What the host learnt of a first tree is taken to hold for the next ones: how many Gaussians take part, and how many
+    levels there are, give or take `SPARE_LEVELS`.
+    """
+
+    def __init__(self, packed: PackedGaussians, built: BuiltTree) -> None:
+        """Allocate for trees like one that was built of these Gaussians, of at least two leaves."""
+        self._packed, self._count, device = packed, built.count, packed.device
+        depth = min(len(built.levels) + SPARE_LEVELS, LARGEST_DEPTH)
+        self._widths = [min(WIDTH**level, self._count) for level in range(depth)]
+        self._order = MortonOrder(len(packed), device)
+        self._binary = _binary_room(self._count, device)
+        self._binary.items, self._binary.leaf_count = self._order.items, self._count
+        self._layout = _layout_room(self._count, device)
+        self._tree = _tree_room(self._layout, self._count, self._count, device)
+        self._queues = [wp.empty(self._count, dtype=int, device=device) for _ in range(2)]
+        self._root_alone = wp.array(ROOT_ALONE, dtype=int, device=device)
+        self._root = wp.array([self._count], dtype=int, device=device)
+        self._graphs = StepGraphs(device)
+
+    def launch(self) -> None:
+        """Build the tree of the Gaussians as they are packed now, in the arrays of the one before, without waiting."""
+        self._graphs.run("build", self._build)
+
+    def built(self, count: int) -> BuiltTree | None:
+        """Return the tree that was launched last, of so many Gaussians; waits for the device.
+
+        None where the number is another one, or where the tree is deeper than was expected.
+        """
+        levels = _levels(self._layout)
+        if count != self._count or len(levels) > len(self._widths) or sum(levels[-1]) > LARGEST_NODE_COUNT:
+            return None
+        return BuiltTree(self._tree, "fast", count, levels, self._layout)
+
+    def _build(self) -> None:
+        """Take every step of a build."""
+        packed, device = self._packed, self._packed.device
+        self._order.find(packed.lowers, packed.uppers, packed.takes_part)
+        launch_split_runs(self._count - 1, self._order.keys, self._count, self._binary, device)
+        wp.copy(self._layout.level_sizes, self._root_alone)
+        wp.copy(self._queues[0], self._root, count=1)
+        for level, width in enumerate(self._widths):
+            queue, following = self._queues[level % 2], self._queues[1 - level % 2]
+            launch_open_level(width, self._binary, 0, level, queue, following, self._layout, device)
+        _bound(self._layout, self._tree, self._count, self._widths, packed)

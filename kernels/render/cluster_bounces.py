@@ -148,12 +148,13 @@ def facing_radiosity(
         place = load_row(clusters.places, j)
         away = first_three(place) - point
         here = wp.dot(away, normal)
-        there = -wp.dot(away, first_three(load_row(clusters.sides, j)))
-        if here > 0.0 and there > 0.0:
-            squared = wp.dot(away, away)
-            area = place[3] * here * there
-            factor = quick_divide(area, squared * (squared + place[3] * INVERSE_PI) + 1.0e-20)
-            total += factor * with_fourth(first_three(load_row(radiosity, j)), 1.0)
+        if here > 0.0:  # what most clusters fail is asked before more of them is loaded
+            there = -wp.dot(away, first_three(load_row(clusters.sides, j)))
+            if there > 0.0:
+                squared = wp.dot(away, away)
+                area = place[3] * here * there
+                factor = quick_divide(area, squared * (squared + place[3] * INVERSE_PI) + 1.0e-20)
+                total += factor * with_fourth(first_three(load_row(radiosity, j)), 1.0)
     return total
 
 

@@ -27,7 +27,7 @@ DARK = wp.constant(0.9)
 """Part of the stop below which the product of all hits is below the stop in any order, rounded or not."""
 
 HIT_THREADS = 64
-"""Threads of a block of the kernels that keep hits: each has a column of shared memory."""
+"""Most threads of a block of the kernels that keep hits: each has a column of shared memory."""
 
 Hits = wp.types.vector(length=BUFFER_SIZE, dtype=wp.uint64)
 LAST = wp.constant(BUFFER_SIZE - 1)
@@ -46,9 +46,9 @@ READ, INSERT, SORT = (wp.constant(k) for k in range(3))
 
 _HITS = """
 #if defined(__CUDA_ARCH__)
-    __shared__ wp::uint64 kept[SIZE * THREADS];
+    constexpr int stride = WP_TILE_BLOCK_DIM < THREADS ? WP_TILE_BLOCK_DIM : THREADS;
+    __shared__ wp::uint64 kept[SIZE * stride];
     wp::uint64* own = kept + threadIdx.x;
-    const int stride = THREADS;
 #else
     wp::uint64* own = &buffer.hits[0];
     const int stride = 1;
@@ -300,5 +300,5 @@ def trace_surface_kernel(
     out_records.mesh_faces[i] = mesh.face
 
 
-launch_trace_surface = launcher(trace_surface_kernel, block_dim=HIT_THREADS)
-"""Trace one ray a thread, front to back."""
+launch_trace_surface = launcher(trace_surface_kernel, block_dim=32)
+"""Trace one ray a thread, front to back. A block is one warp, whose memory is free when its slowest ray is done."""

@@ -23,6 +23,16 @@ class WideLayout:
     items: wp.array[int]  # Gaussian of each leaf
     lower: wp.array[wp.vec3]  # of each node
     upper: wp.array[wp.vec3]
+    level_sizes: wp.array[int]  # nodes of each level; leaves at the end
+
+
+@wp.func
+def nodes_above(level_sizes: wp.array[int], level: int) -> int:
+    """Number of the first node of a level."""
+    begin = int(0)
+    for above in range(level):
+        begin += level_sizes[above]
+    return begin
 
 
 @wp.func
@@ -43,17 +53,16 @@ def open_level_kernel(
     by_area: int,
     level: int,
     queue: wp.array[int],
-    level_sizes: wp.array[int],
     out_queue: wp.array[int],
     out_layout: WideLayout,
 ):
     """Open each queued binary node to up to four children, and queue the inner ones for the next level.
 
-    The largest is opened, by the area of its box, or by its leaves where boxes are not known yet. ``level_sizes``
-    holds the nodes of each level, and the leaves so far behind them. Numbers come from counters and so from the order
-    of threads; what a ray meets, and in which order, does not.
+    The largest is opened, by the area of its box, or by its leaves where boxes are not known yet. Numbers come from
+    counters and so from the order of threads; what a ray meets, and in which order, does not.
     """
     i = first + wp.tid()
+    level_sizes = out_layout.level_sizes
     if i < level_sizes[level]:
         found = wp.vec4i(queue[i], -1, -1, -1)
         count = int(1)
@@ -87,9 +96,7 @@ def open_level_kernel(
         for k in range(count):
             if found[k] >= tree.leaf_count:
                 inner += 1
-        begin = int(0)
-        for above in range(level):
-            begin += level_sizes[above]
+        begin = nodes_above(level_sizes, level)
         next_begin = begin + level_sizes[level]
         first_inner = wp.atomic_add(level_sizes, level + 1, inner)
         first_leaf = wp.atomic_add(level_sizes, level_sizes.shape[0] - 1, count - inner)
@@ -149,14 +156,17 @@ def exponent_of(extent: float) -> int:
 @wp.kernel
 def bound_nodes_kernel(
     first: int,
-    level_begin: int,
+    level: int,
     lowers: wp.array[wp.vec3],
     uppers: wp.array[wp.vec3],
     out_layout: WideLayout,
     out_tree: WideTree,
 ):
-    """Bound a node and write it, its children's boxes in steps from its corner, rounded outwards."""
-    node = level_begin + first + wp.tid()
+    """Bound a node of a level and write it, its children's boxes in steps from its corner, rounded outwards."""
+    i = first + wp.tid()
+    if i >= out_layout.level_sizes[level]:
+        return
+    node = nodes_above(out_layout.level_sizes, level) + i
     children = out_layout.children[node]
     lower = wp.vec3(LARGEST_FLOAT)
     upper = wp.vec3(-LARGEST_FLOAT)
@@ -218,4 +228,4 @@ launch_fill_leaves = launcher(fill_leaves_kernel)
 
 
 launch_bound_nodes = launcher(bound_nodes_kernel)
-"""Write a level's nodes; the level below must be done."""
+"""Write a level of at most ``bound`` nodes; the level below must be done."""

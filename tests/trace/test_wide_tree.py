@@ -19,7 +19,7 @@ from beam_warp.trace.packing import PackedGaussians
 from beam_warp.trace.reference import FLOAT32_ROUNDOFF, visibility_enclosure
 from beam_warp.trace.scene import NOTHING
 from beam_warp.trace.transmittance import TraceOptions
-from beam_warp.trace.wide_tree import build_wide_tree, refit
+from beam_warp.trace.wide_tree import RepeatedBuild, build_wide_tree, refit
 
 METHODS = ("quality", "fast", "places")
 WHOLE = TraceOptions(stop=0.0)
@@ -37,7 +37,7 @@ class Decoded:
     """A tree read back: who is whose child, and the boxes that rays meet, in float64."""
 
     def __init__(self, built):
-        rows = built.tree.nodes.numpy().reshape(-1, 3, 4)
+        rows = built.tree.nodes.numpy().reshape(-1, 3, 4)[: sum(built.levels[-1])]
         words = rows[:, 0, 3].view(np.uint32)
         self.inner, self.count = (words >> 24) & 7, (words >> 28) & 7
         self.axis = ((words >> 27) & 1) | ((words >> 30) & 2)
@@ -128,6 +128,23 @@ class TestStructure:
         )
         refit(built, packed)
         require_sound(built, packed)
+
+    def test_repeated_builds_are_sound_or_none(self, device, rng):
+        """None where another number takes part or the tree is much deeper; what is built after that is sound again."""
+        packed = packed_of(random_cloud(rng, 300, opacity=(0.1, 1.0)), device)
+        repeated = RepeatedBuild(packed, build(packed, "fast"))
+        shaken, deep = rng.normal(size=(300, 3)), np.repeat(2.0 ** -np.arange(100), 3)[:, None] * [1.0, 0.0, 0.0]
+        for positions, sound in ((shaken, True), (deep, False), (shaken * np.nan, False), (shaken[::-1], True)):
+            packed.place(
+                wp.array(positions, dtype=wp.vec3, device=device),
+                wp.full(300, wp.quat(0.0, 0.0, 0.0, 1.0), dtype=wp.quat, device=device),
+                wp.full(300, wp.vec3(1e-9), dtype=wp.vec3, device=device),
+            )
+            repeated.launch()
+            built = repeated.built(int(packed.takes_part.numpy().sum()))
+            assert (built is not None) == sound
+            if built is not None:
+                require_sound(built, packed)
 
     @pytest.mark.parametrize("method", METHODS)
     def test_thread_counts_make_the_same_whole_tree(self, rng, monkeypatch, method):
