@@ -215,7 +215,7 @@ def project_function(with_camera: bool):
 project_still, project_moved = project_function(False), project_function(True)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def project_gaussians_kernel(
     first: int,
     positions: wp.array[wp.vec3],
@@ -231,7 +231,7 @@ def project_gaussians_kernel(
     project_still(splat, positions, orientations, scales, opacities, view, CameraMove(), projection, out_splats)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def project_with_cameras_kernel(
     first: int,
     positions: wp.array[wp.vec3],
