@@ -14,7 +14,7 @@ from beam_warp.kernels.raster.composite_adjoint_cpu import launch_composite_adjo
 from beam_warp.kernels.raster.composite_adjoint_cuda import launch_composite_adjoint_cuda
 from beam_warp.kernels.raster.pair_sums import launch_resolve_sums, launch_sum_pairs
 from beam_warp.kernels.raster.project import CameraMove, Splats, launch_project_adjoint
-from beam_warp.raster.buffers import FrameBuffers, zero_splats
+from beam_warp.raster.buffers import FrameBuffers
 from beam_warp.raster.layout import Rows, channel_rows
 from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianArrays, GaussianGradients, RasterImages
 
@@ -37,12 +37,12 @@ class BackwardBuffers:
             self.images = RasterImages(tuple(rows.matrix for rows in self._adjoints), *flat)
             lengths = [pair_length(rows.length, drawn.exact) for rows in self._adjoints]
             self._sums = [wp.zeros((splat_count, length), dtype=float) for length in lengths]
-            self._splats = zero_splats(splat_count)
+            self._splats = drawn.zero_splats()
             self._blocks = drawn.zero_blocks(len(drawn.channels.values), self._splats.normals)
             geometry = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec3, wp.quat, wp.vec3, float)]
             self.gaussians = GaussianGradients(*geometry, values=self._blocks.values if drawn.channels.values else None)
-        # Their own: the adjoint projects anew and writes them, with other roundings than those that were drawn.
-        self._tracked = _with_gradients(zero_splats(splat_count), self._splats)
+            # Their own: the adjoint projects anew and writes them, with other roundings than those that were drawn.
+            self._tracked = _with_gradients(drawn.zero_splats(), self._splats)
         self._cameras: CameraBuffers | None = None
 
     def begin(self, gaussians: GaussianArrays) -> None:
@@ -69,9 +69,10 @@ class BackwardBuffers:
         for rows, adjoint, sums in zip(drawn.rows, self._adjoints, self._sums, strict=True):
             pairs = drawn.pair_rows(sums.shape[1])
             arguments = (drawn.frame, rows.vectors, drawn.exact, drawn.drawn, adjoint.vectors, upstream)
+            drawn.begin_sums()
             differentiate(*arguments, pairs.vectors, drawn.device)
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
-            launch_sum_pairs(sums.size, pairs.matrix, drawn.order, sums, drawn.device)
+            launch_sum_pairs(sums.size, pairs.matrix, drawn.frame.lists, drawn.order, sums, drawn.device)
 
     def resolve(self, gaussians: GaussianArrays, to_cameras: wp.array | None) -> GaussianGradients:
         """Turn sums over pairs into the gradients of Gaussians, and of cameras if they are asked for."""
@@ -123,8 +124,9 @@ def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> N
         return
     back_project = launch_back_project_cuda if drawn.device.is_cuda else launch_back_project_cpu
     pairs = drawn.pair_rows(pixels.shape[1])
+    drawn.begin_sums()
     back_project(drawn.frame, drawn.drawn, Rows.of(pixels).vectors, pairs.vectors, drawn.device)
-    launch_sum_pairs(out.size, pairs.matrix, drawn.order, out, drawn.device)
+    launch_sum_pairs(out.size, pairs.matrix, drawn.frame.lists, drawn.order, out, drawn.device)
 
 
 def _with_gradients(splats: Splats, gradients: Splats) -> Splats:

@@ -12,6 +12,7 @@ from beam_warp.kernels.raster.bin_tiles import PairList, SplatOrder, TileLists
 from beam_warp.kernels.raster.channel_rows import ChannelBlocks
 from beam_warp.kernels.raster.composite import Images, RasterFrame
 from beam_warp.kernels.raster.project import Projection, RasterView, Splats
+from beam_warp.kernels.raster.tile_lists_cuda import SPREAD
 from beam_warp.raster.layout import ChannelRanges, Rows, ViewLayout, channel_rows
 from beam_warp.raster.records import RasterImages, RasterOptions
 from beam_warp.world.camera import Camera
@@ -32,10 +33,10 @@ class FrameBuffers:
         splats: The splats of every view, V * N of them.
         rows: The splats' channels, a pass each.
         blocks: Where the channels of a splat come from.
-        keys: Depths to sort splats by; like ``order.splats``, of twice the length, which sorting needs.
-        order: The splats in depth order, and where each one's pairs end.
-        pairs: The (tile, splat) pairs of a band.
-        tile_counts: Tiles of long lists, and others, while tiles are put in order.
+        keys: Depths to sort splats by; like ``order.splats``, of twice the length, which sorting needs. None on CUDA.
+        order: The splats in depth order, on CUDA in their own order, and where each one's pairs end.
+        pairs: The (tile, splat) pairs of a band; on CUDA only the owners.
+        tallies: Numbers of pairs of each tile of a band, on CUDA.
         frame: Input of compositing, for kernels.
         drawn: Images besides channels, for kernels.
         channel_images: Images of channels, a pass each.
@@ -89,17 +90,22 @@ class FrameBuffers:
         """Make room for pairs."""
         with wp.ScopedDevice(self.device):
             self.pairs = PairList()
-            self.pairs.tiles = wp.zeros(2 * capacity, dtype=int)  # the sort wants room for as many again
-            self.pairs.slots = wp.zeros(2 * capacity, dtype=int)
+            emitted = 0 if self.device.is_cuda else capacity
+            self.pairs.tiles = wp.zeros(2 * emitted, dtype=int)  # the sort wants room for as many again
+            self.pairs.slots = wp.zeros(2 * emitted, dtype=int)
             self.pairs.owners = wp.zeros(capacity, dtype=int)
-            self.listed_tiles = self.pairs.tiles[:capacity] if capacity else self.pairs.tiles
+            self.listed_tiles = self.pairs.tiles[:emitted] if emitted else self.pairs.tiles
             lists = TileLists()
             tile_count = int(self.layout.first_tiles[-1])
             lists.ranges = wp.zeros(tile_count, dtype=wp.vec2i)
-            lists.order = wp.array(np.arange(tile_count), dtype=int)
-            self.tile_counts = wp.zeros(2, dtype=int)
             lists.splats = wp.zeros(capacity, dtype=int)
             lists.slots = self.pairs.slots
+            if self.device.is_cuda:
+                lists.order = wp.zeros(tile_count, dtype=int)
+                lists.slots = wp.zeros(capacity, dtype=int)
+                lists.entries, lists.parted = (wp.zeros(capacity, dtype=wp.uint64) for _ in range(2))
+                lists.owners = self.pairs.owners
+                lists.summed = wp.zeros(capacity, dtype=wp.uint8)
         self.frame.lists = lists
         self._pair_rows: dict[int, Rows] = {}
 
@@ -109,12 +115,25 @@ class FrameBuffers:
             self._pair_rows[length] = Rows.zeros(self.pair_capacity, length, self.device)
         return self._pair_rows[length]
 
+    def begin_sums(self) -> None:
+        """Forget which pairs' rows were written, where that is noted: on CUDA."""
+        if self.device.is_cuda:
+            self.frame.lists.summed.zero_()
+
+    def zero_splats(self) -> Splats:
+        """Allocate splats on the current device, with normals if they are drawn."""
+        splats = Splats()
+        for name, dtype in {"centers": wp.vec4, "shapes": wp.vec4, "slopes": wp.vec4, "bends": float}.items():
+            setattr(splats, name, wp.zeros(self.splat_count, dtype=dtype))
+        splats.normals = wp.zeros(self.splat_count if self.channels.normals else 0, dtype=wp.vec3)
+        return splats
+
     def zero_blocks(self, value_count: int, normals: wp.array) -> ChannelBlocks:
         """Return where channels come from or their gradients go: values and colours of their own, normals if drawn."""
         blocks = ChannelBlocks()
         blocks.values = wp.zeros((self.gaussian_count if value_count else 0, value_count), dtype=float)
         blocks.colors = wp.zeros(self.splat_count if self.channels.colors else 0, dtype=wp.vec3)
-        blocks.normals = normals if self.channels.normals else wp.zeros(0, dtype=wp.vec3)
+        blocks.normals = normals
         return blocks
 
     def _require_room(self, other: FrameBuffers) -> None:
@@ -130,14 +149,16 @@ class FrameBuffers:
     def _allocate_splats(self) -> None:
         """Allocate splats, their channels and their order."""
         count = self.splat_count
-        self.splats = zero_splats(count)
+        self.splats = self.zero_splats()
         self.rows = channel_rows(count, self.channels.count, self.device)
         self.blocks = self.zero_blocks(0, self.splats.normals)
-        self.keys = wp.zeros(2 * count, dtype=int)
+        sorts = not self.device.is_cuda
+        self.keys = wp.zeros(2 * count * sorts, dtype=int)
         self.order = SplatOrder()
-        self.order.splats = wp.zeros(2 * count, dtype=int)
+        self.order.splats = wp.zeros(2 * count, dtype=int) if sorts else wp.array(np.arange(count), dtype=int)
         self.order.counts = wp.zeros(count, dtype=int)
         self.order.ends = wp.zeros(count, dtype=int)
+        self.tallies = wp.zeros(0 if sorts else int(self.layout.first_tiles[-1]) * SPREAD, dtype=int)
 
     def _allocate_images(self, images_of: FrameBuffers | None) -> None:
         """Allocate images, or take the first pixels of another frame's."""
@@ -163,15 +184,6 @@ class FrameBuffers:
         self.frame.tile_views = wp.array(self.layout.tile_views, dtype=int)
         self.frame.gaussian_count = self.gaussian_count
         self.frame.near = options.near
-
-
-def zero_splats(count: int) -> Splats:
-    """Allocate splats on the current device."""
-    splats = Splats()
-    kinds = {"centers": wp.vec4, "shapes": wp.vec4, "slopes": wp.vec4, "bends": float, "normals": wp.vec3}
-    for name, dtype in kinds.items():
-        setattr(splats, name, wp.zeros(count, dtype=dtype))
-    return splats
 
 
 def _zero_images(pixel_count: int, *, has_states: bool) -> Images:

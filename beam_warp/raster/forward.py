@@ -14,19 +14,24 @@ from beam_warp.kernels.raster.bin_tiles import (
     launch_emit_pairs,
     launch_find_ranges,
     launch_key_splats,
-    launch_order_tiles,
 )
 from beam_warp.kernels.raster.channel_rows import launch_evaluate_colors, launch_gather_channels
 from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
 from beam_warp.kernels.raster.composite_cpu import launch_composite_cpu
 from beam_warp.kernels.raster.composite_cuda import launch_composite_cuda
 from beam_warp.kernels.raster.project import launch_project
+from beam_warp.kernels.raster.tile_lists_cuda import (
+    launch_count_entries,
+    launch_emit_entries,
+    launch_plan_tiles,
+    launch_project_entries,
+)
 from beam_warp.raster.buffers import FrameBuffers
 from beam_warp.raster.records import GaussianArrays
 
 MAX_BAND_PAIRS = 2**24
-"""Most (tile, splat) pairs held at a time: 24 bytes each, and on the way back up to 128 more for each length of rows.
-Images that need more are drawn in bands of tile rows."""
+"""Most (tile, splat) pairs held at a time: 24 bytes each, 29 on CUDA, and on the way back up to 128 more for each
+length of rows. Images that need more are drawn in bands of tile rows."""
 
 MAX_ROW_PAIRS = 2**29
 """Most pairs in one row of tiles, the least that can be drawn: with `SPARE_CAPACITY`, and as much again for sorting, a
@@ -37,17 +42,28 @@ SPARE_CAPACITY = 1.25
 
 
 def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
-    """Make splats of the Gaussians, and put them in their order in depth."""
-    launch_project(gaussians[:4], buffers.views, buffers.projection, buffers.splats, buffers.device)
+    """Make splats of the Gaussians; on CUDA count the pairs of all tiles, elsewhere order the splats in depth."""
+    is_cuda, tiles = buffers.device.is_cuda, (0, int(buffers.layout.first_tiles[-1]))
+    inputs = (gaussians[:4], buffers.views, buffers.projection)
+    if is_cuda:
+        counted = buffers.order.counts, buffers.tallies
+        buffers.tallies.zero_()
+        launch_project_entries(*inputs, _begin_band(buffers, tiles), buffers.splats, *counted, buffers.device)
+        _sum_counts(buffers)
+    else:
+        launch_project(*inputs, buffers.splats, buffers.device)
     if buffers.channels.colors:
         launch_evaluate_colors(
             gaussians.positions, gaussians.radiance, buffers.views, buffers.blocks.colors, buffers.device
         )
     if buffers.channels.values:
         buffers.blocks.values = gaussians.values
+    if is_cuda:  # every tile sorts its own list
+        return
     launch_key_splats(len(buffers.splats.centers), buffers.splats, buffers.keys, buffers.order.splats, buffers.device)
     if buffers.splat_count:
         wp.utils.radix_sort_pairs(buffers.keys, buffers.order.splats, buffers.splat_count)
+    count_pairs(buffers, tiles)
 
 
 def gather_channels(buffers: FrameBuffers) -> None:
@@ -68,7 +84,8 @@ def plan_bands(buffers: FrameBuffers) -> list[tuple[int, int]]:
     while waiting:
         first, end = waiting.pop()
         band = (int(first_tiles[first]), int(first_tiles[end]))
-        count_pairs(buffers, band)
+        if end - first < len(first_tiles) - 1:  # all of them are counted since they were projected
+            count_pairs(buffers, band)
         pairs = counted_pairs(buffers)
         if pairs > MAX_BAND_PAIRS and end - first > 1:
             middle = (first + end) // 2
@@ -88,15 +105,28 @@ def plan_bands(buffers: FrameBuffers) -> list[tuple[int, int]]:
 
 def count_pairs(buffers: FrameBuffers, tiles: tuple[int, int]) -> None:
     """Count the pairs of a band of tiles, splat by splat in depth order, and sum the counts up."""
+    band, order = _begin_band(buffers, tiles), buffers.order
+    inputs = (buffers.splats, buffers.views, buffers.gaussian_count, band, order.counts)
+    if buffers.device.is_cuda:
+        buffers.tallies.zero_()
+        launch_count_entries(buffers.splat_count, *inputs, buffers.tallies, buffers.device)
+    else:
+        launch_count_pairs(order.splats, *inputs, buffers.device)
+    _sum_counts(buffers)
+
+
+def _begin_band(buffers: FrameBuffers, tiles: tuple[int, int]) -> Band:
+    """Make tiles those that are counted, listed and drawn next."""
     band = Band()
     band.first_tile, band.end_tile = tiles
     buffers.frame.band = band
-    order = buffers.order
-    launch_count_pairs(
-        order.splats, buffers.splats, buffers.views, buffers.gaussian_count, band, order.counts, buffers.device
-    )
+    return band
+
+
+def _sum_counts(buffers: FrameBuffers) -> None:
+    """Find where the pairs of every splat end."""
     if buffers.splat_count:
-        wp.utils.array_scan(order.counts, order.ends, inclusive=True)
+        wp.utils.array_scan(buffers.order.counts, buffers.order.ends, inclusive=True)
 
 
 def counted_pairs(buffers: FrameBuffers) -> int:
@@ -113,17 +143,18 @@ def list_pairs(buffers: FrameBuffers) -> None:
     frame, pairs = buffers.frame, buffers.pairs
     band = frame.band
     tile_count = band.end_tile - band.first_tile
+    inputs = (buffers.order, buffers.splats, buffers.views, buffers.gaussian_count, band)
+    if buffers.device.is_cuda:
+        launch_plan_tiles(buffers.tallies, tile_count, buffers.pair_capacity, frame.lists, buffers.device)
+        launch_emit_entries(*inputs, buffers.tallies, frame.lists, buffers.device)
+        return
     frame.lists.ranges.zero_()
     if not buffers.pair_capacity:
         return
     buffers.listed_tiles.fill_(tile_count)  # sorts behind every tile: room that no pair takes
-    launch_emit_pairs(buffers.order, buffers.splats, buffers.views, buffers.gaussian_count, band, pairs, buffers.device)
+    launch_emit_pairs(*inputs, pairs, buffers.device)
     wp.utils.radix_sort_pairs(pairs.tiles, pairs.slots, buffers.pair_capacity, end_bit=tile_count.bit_length())
     launch_find_ranges(pairs, tile_count, frame.lists, buffers.device)
-    if buffers.device.is_cuda:
-        buffers.tile_counts.zero_()
-        tiles = frame.lists.ranges[:tile_count], buffers.order.ends
-        launch_order_tiles(tile_count, *tiles, buffers.tile_counts, frame.lists.order[:tile_count], buffers.device)
 
 
 def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) -> None:

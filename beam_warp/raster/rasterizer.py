@@ -198,7 +198,6 @@ class Rasterizer:
         if self.is_whole:
             with wp.ScopedDevice(self.device):
                 forward.project(self._buffers, gaussians)
-                forward.count_pairs(self._buffers, self._bands[0])
                 forward.list_pairs(self._buffers)
 
     def redraw_values(self) -> RasterImages:
@@ -304,6 +303,8 @@ class Rasterizer:
             if len(self._bands) > 1:
                 forward.count_pairs(self._buffers, band)
                 forward.list_pairs(self._buffers)
+                if self.device.is_cuda:  # compositing sorts the lists
+                    self._composite()
             yield band
 
     def _drawn_gaussians(self, caller: str) -> GaussianArrays:

@@ -34,16 +34,6 @@ def greatest_of_lanes(value: int) -> int:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __syncwarp();
-#endif
-""")
-def wait_for_lanes():
-    """Return when all lanes are here, and see what they wrote."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
     __syncthreads();
 #endif
 """)
@@ -74,6 +64,18 @@ def greatest_of_block(value: int) -> int:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    return __syncthreads_or(flag);
+#else
+    return flag;
+#endif
+""")
+def any_of_block(flag: int) -> int:
+    """Whether the flag of any thread of the block is not 0. All must call it together."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
     return __ffs(bits) - 1;
 #else
     return __builtin_ctz(bits);
@@ -86,8 +88,8 @@ def lowest_lane(bits: int) -> int:
 
 _SHARE_ROW = """
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 shared[GROUPS * KINDS * 32];
-    float4* place = shared + ((threadIdx.x >> 5) % GROUPS * KINDS + kind) * 32 + index;
+    __shared__ float4 shared[KINDS * COUNT];
+    float4* place = shared + kind * COUNT + index;
     if (store) {
         *place = make_float4(row[0], row[1], row[2], row[3]);
         return row;
@@ -102,15 +104,15 @@ _SHARE_ROW = """
 _SHARE_CHANNELS = """
     wp::vec_t<LENGTH, float> row;
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 shared[GROUPS * 8 * LENGTH];
-    float4* place = shared + (threadIdx.x >> 5) % GROUPS * (8 * LENGTH) + index;
+    __shared__ float4 shared[COUNT * (LENGTH / 4)];
+    float4* place = shared + index;
     const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(splat) * (LENGTH / 4);
     #pragma unroll
     for (int i = 0; i < LENGTH / 4; ++i) {
         if (store) {
-            place[32 * i] = __ldg(source + i);
+            place[COUNT * i] = __ldg(source + i);
         } else {
-            const float4 part = place[32 * i];
+            const float4 part = place[COUNT * i];
             row[4 * i] = part.x;
             row[4 * i + 1] = part.y;
             row[4 * i + 2] = part.z;
@@ -177,12 +179,12 @@ HALVINGS        if (lane % (32 / WIDTH) == 0 && place < LENGTH)
 
 
 @cache
-def share_row_function(kinds: int, groups: int):
+def share_row_function(kinds: int, count: int):
     """Return the function that puts a row into shared memory or, with ``store`` 0, takes it from there.
 
-    There are 32 rows of each of some kinds, for every warp of ``groups``, or for the whole block with 1.
+    A block has ``count`` rows of each of some kinds.
     """
-    snippet = _SHARE_ROW.replace("KINDS", str(kinds)).replace("GROUPS", str(groups))
+    snippet = _SHARE_ROW.replace("KINDS", str(kinds)).replace("COUNT", str(count))
 
     @wp.func_native(snippet)
     def share_row(store: int, kind: int, index: int, row: wp.vec4) -> wp.vec4: ...
@@ -191,12 +193,12 @@ def share_row_function(kinds: int, groups: int):
 
 
 @cache
-def share_channels_function(Channels, groups: int):
+def share_channels_function(Channels, count: int):
     """Return the function that copies a splat's channels to shared memory or, with ``store`` 0, takes them from there.
 
-    There are 32 rows for every warp of ``groups``, or for the whole block with 1.
+    A block has ``count`` rows.
     """
-    snippet = _SHARE_CHANNELS.replace("LENGTH", str(Channels._length_)).replace("GROUPS", str(groups))
+    snippet = _SHARE_CHANNELS.replace("LENGTH", str(Channels._length_)).replace("COUNT", str(count))
 
     @wp.func_native(snippet)
     def share_channels(store: int, index: int, channels: wp.array[Channels], splat: int) -> Channels: ...

@@ -35,7 +35,7 @@ from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_f
 def back_project_cuda_kernel(channel_count: int):
     """Return the kernel that writes ``channel_count`` sums for every pair, a block a tile."""
     Channels = channel_vector(channel_count)
-    share_row = share_row_function(2, 1)
+    share_row = share_row_function(2, LANES)
     sum_block = sum_block_function(channel_count, WARPS)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -73,8 +73,6 @@ def back_project_cuda_kernel(channel_count: int):
         lower_transmittance = float(1.0)
         own_end = greatest_of_lanes(wp.max(upper_end, lower_end))
         end = greatest_of_block(own_end)
-        for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
-            out_pairs[frame.lists.slots[k]] = Channels()
         begin = listed_range[0]
         while begin < end:
             mine = begin + lane
@@ -83,6 +81,7 @@ def back_project_cuda_kernel(channel_count: int):
             if mine < end:
                 slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
+                frame.lists.summed[slot] = wp.uint8(1)
                 if part == 0:
                     share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
                 if part == 1:

@@ -1,7 +1,9 @@
-"""Lists of the splats that each tile draws, in depth order: count, emit, sort, find ranges.
+"""Lists of the splats that each tile draws, in depth order, on the CPU: count, emit, sort, find ranges.
 
 Splats are sorted by depth once; their (tile, splat) pairs are emitted in that order and sorted by tile alone with a
-stable sort, which costs half of one sort by (tile, depth) and gives the same order (Schütz et al. 2025, Splatshop).
+stable sort, which costs half of one sort by (tile, depth) and gives the same order (Schütz et al. 2025, Splatshop). On
+CUDA, `tile_lists_cuda` brings the same pairs into the same order.
+
 A tile lists a splat only if the ellipse where its alpha is 1/255 reaches it, not already if its box does (Hanson et al.
 2025, Speedy-Splat).
 
@@ -49,9 +51,14 @@ class TileLists:
     """The splats of every tile of a band, tile by tile and nearest first."""
 
     ranges: wp.array[wp.vec2i]  # of each tile, in ``splats``
-    order: wp.array[int]  # tiles as CUDA draws them, counted from the band's first
     splats: wp.array[int]
     slots: wp.array[int]  # where each pair was emitted
+    # On CUDA only, where lists are sorted as far as they are drawn:
+    order: wp.array[int]  # tiles in the order of drawing, counted from the band's first
+    entries: wp.array[wp.uint64]  # depth and slot of each pair, tile by tile
+    parted: wp.array[wp.uint64]  # entries of long lists, parted by depth
+    owners: wp.array[int]  # the splat of each slot
+    summed: wp.array[wp.uint8]  # 1 where the way back has written the row of a slot
 
 
 @wp.struct
@@ -190,30 +197,6 @@ def find_ranges_kernel(
     if i == pairs.owners.shape[0] - 1 or pairs.tiles[i + 1] != tile:
         out_ranges[tile][1] = i + 1
 
-
-LONG = wp.constant(5)
-"""Times the mean length, from which on a tile's list is drawn early."""
-
-
-@wp.kernel
-def order_tiles_kernel(
-    first: int, ranges: wp.array[wp.vec2i], ends: wp.array[int], out_counts: wp.array[int], out_order: wp.array[int]
-):
-    """Tiles of long lists come first, in any order: what begins last should not take longest.
-
-    They lie where a surface is seen edge on.
-    """
-    tile = first + wp.tid()
-    count = out_order.shape[0]
-    length = ranges[tile][1] - ranges[tile][0]
-    if length > LONG * (ends[ends.shape[0] - 1] / count):
-        out_order[wp.atomic_add(out_counts, 0, 1)] = tile
-    else:
-        out_order[count - 1 - wp.atomic_add(out_counts, 1, 1)] = tile
-
-
-launch_order_tiles = launcher(order_tiles_kernel, in_order=True)
-"""Put the tiles of a band in order; ``out_counts``, two numbers, must be 0. For CUDA."""
 
 launch_key_splats = launcher(key_splats_kernel)
 """Write every splat's depth key and number."""

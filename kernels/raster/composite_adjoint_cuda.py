@@ -78,8 +78,8 @@ def own_pixel(place: PixelPlace, images: Images, adjoints: Adjoints) -> OwnPixel
 def share_splat_function(channel_count: int, exact: bool):
     """Return the function that brings a splat to shared memory, a part of it by each warp."""
     Channels = channel_vector(channel_count)
-    share_row = share_row_function(4 if exact else 3, 1)
-    share_channels = share_channels_function(Channels, 1)
+    share_row = share_row_function(4 if exact else 3, LANES)
+    share_channels = share_channels_function(Channels, LANES)
 
     @wp.func
     def share_splat(part: int, lane: int, frame: RasterFrame, channels: wp.array[Channels], splat: int):
@@ -103,8 +103,8 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     add_pixel = add_pixel_function(channel_count, exact)
-    share_row = share_row_function(4 if exact else 3, 1)
-    share_channels = share_channels_function(Channels, 1)
+    share_row = share_row_function(4 if exact else 3, LANES)
+    share_channels = share_channels_function(Channels, LANES)
     share_splat = share_splat_function(channel_count, exact)
     sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
 
@@ -141,8 +141,6 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
             to_lower = channel_adjoints[lower.index]
         own_end = greatest_of_lanes(wp.max(upper.end, lower.end))
         end = greatest_of_block(own_end)
-        for k in range(wp.max(end, listed_range[0]) + thread, listed_range[1], THREADS):
-            out_pairs[frame.lists.slots[k]] = Pair()
         while end > listed_range[0]:
             mine = end - 1 - lane
             slot = int(-1)
@@ -151,6 +149,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                 slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
                 share_splat(part, lane, frame, channels, splat)
+                frame.lists.summed[slot] = wp.uint8(1)
             sum_block(BEGIN_SUMS, slot, Pair(), out_pairs)
             wait_for_block()
             wanted = int(0)

@@ -1,7 +1,8 @@
-"""Compositing on CUDA: 8 x 4 pixels a warp, a lane for each.
+"""Compositing on CUDA: a tile a block, 8 x 4 pixels a warp, a pixel a lane.
 
-The lanes look at 32 splats of the tile's list at once, a lane for each: which of them reach the warp's pixels? Those go
-to shared memory, and the warp composites them one after the other on all its pixels. It is done when all pixels are.
+The block sorts its tile's list, as far as its pixels look, and brings `THREADS` splats at a time to shared memory. The
+lanes of a warp look at 32 of these at once: which reach the warp's pixels? The warp composites those, one after the
+other. The block is done when all its pixels are.
 """
 
 from functools import cache
@@ -10,15 +11,16 @@ import warp as wp
 
 from beam_warp.kernels.common.constants import TRANSMITTANCE_STOP
 from beam_warp.kernels.common.lanes import (
+    any_of_block,
     ballot,
     lowest_lane,
     share_channels_function,
     share_row_function,
-    wait_for_lanes,
+    wait_for_block,
 )
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
-from beam_warp.kernels.raster.bin_tiles import SIDE, TileLists
+from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
@@ -26,21 +28,26 @@ from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
     RELATIVE_MARGIN,
     alpha_of,
-    depth_function,
+    depth_limits,
+    limited_depth_function,
     log_alpha_of,
     offset_from,
     quick_divide,
     squared_extent,
     whiten,
 )
+from beam_warp.kernels.raster.tile_lists_cuda import THREADS, sort_entries
 
 LANES = wp.constant(32)
 WIDTH = wp.constant(8)
 HEIGHT = wp.constant(4)
 """Pixels of a warp."""
 
-WARPS = 4
-"""Warps of a block; they share nothing."""
+BLOCKS = 4
+"""Blocks that a multiprocessor should hold at least: they limit registers."""
+
+NOWHERE = wp.constant(wp.vec4(0.0, 0.0, -1.0e30, 0.0))
+"""Centre of what reaches no pixel."""
 
 CENTER, SHAPE, SLOPE, BEND = (wp.constant(k) for k in range(4))
 
@@ -72,25 +79,16 @@ def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, width: int, height:
     return wp.where(least <= squared_extent(center[2]), 1, 0)
 
 
-@wp.func
-def listed_splat(lists: TileLists, place: int, end: int) -> int:
-    """The splat at a place of the lists; any where they end."""
-    splat = int(0)
-    if place < end:
-        splat = lists.splats[place]
-    return splat
-
-
 @cache
 def composite_cuda_kernel(channel_count: int, exact: bool):
     """Return the kernel that composites ``channel_count`` channels, an item a pixel."""
     Channels = channel_vector(channel_count)
-    depth_at = depth_function(exact)
-    share_row = share_row_function(4 if exact else 3, WARPS)
-    share_channels = share_channels_function(Channels, WARPS)
+    depth_at = limited_depth_function(exact)
+    share_row = share_row_function(4 if exact else 3, THREADS)
+    share_channels = share_channels_function(Channels, THREADS)
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def composite_warps_kernel(
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=(THREADS, BLOCKS), grid_stride=False)
+    def composite_blocks_kernel(
         first: int,
         frame: RasterFrame,
         channels: wp.array[Channels],
@@ -98,14 +96,15 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
         out_images: Images,
     ):
         item = first + wp.tid()
-        lane = item % LANES
-        listed = frame.lists.order[item / (SIDE * SIDE)]
+        thread = item % THREADS
+        lane = thread % LANES
+        listed = frame.lists.order[item / THREADS]
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        part = (item % (SIDE * SIDE)) / LANES
-        corner = ((part / (SIDE / WIDTH)) * HEIGHT) * SIDE + (part % (SIDE / WIDTH)) * WIDTH
-        box = pixel_place(view, tile, corner)
-        place = pixel_place(view, tile, corner + (lane / WIDTH) * SIDE + lane % WIDTH)
+        part = thread / LANES
+        corner = part / (SIDE / WIDTH) * HEIGHT * SIDE + part % (SIDE / WIDTH) * WIDTH
+        box = pixel_place(view, tile, corner).position
+        place = pixel_place(view, tile, corner + lane / WIDTH * SIDE + lane % WIDTH)
         pixel = place.index
         total = Channels()
         depth = float(0.0)
@@ -118,58 +117,72 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
         listed_range = frame.lists.ranges[listed]
         last = int(-1)
         begin = listed_range[0]
-        # What the lanes look at next is loaded while they composite: a list is as slow as its loads otherwise.
-        splat = listed_splat(frame.lists, begin + lane, listed_range[1])
-        following = listed_splat(frame.lists, begin + LANES + lane, listed_range[1])
-        center = wp.vec4()
-        shape = wp.vec4()
-        if begin < listed_range[1]:
-            center = load_row(frame.splats.centers, splat)
-            shape = load_row(frame.splats.shapes, splat)
+        sorted_end = listed_range[0]
         while begin < listed_range[1]:
-            wanted = int(0)
-            if begin + lane < listed_range[1]:
-                wanted = reaches(center, shape, box.position, WIDTH, HEIGHT)
-                if wanted != 0:
-                    share_row(1, CENTER, lane, center)
-                    share_row(1, SHAPE, lane, shape)
-                    share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
-                    if wp.static(exact):
-                        share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
-                    share_channels(1, lane, channels, splat)
-            waiting = ballot(wanted)
-            splat = following
-            center = load_row(frame.splats.centers, splat)
-            shape = load_row(frame.splats.shapes, splat)
-            following = listed_splat(frame.lists, begin + 2 * LANES + lane, listed_range[1])
-            wait_for_lanes()
-            while waiting != 0:
-                bit = lowest_lane(waiting)
-                waiting = waiting & (waiting - 1)
-                drawn = share_row(0, CENTER, bit, wp.vec4())
-                drawn_shape = share_row(0, SHAPE, bit, wp.vec4())
-                offset = offset_from(drawn, place.position)
-                log_alpha = log_alpha_of(drawn, whiten(drawn_shape, offset))
-                seen = transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT
-                if ballot(wp.where(seen, 1, 0)) == 0:
-                    continue
-                # No branches from here on: each would cost a selection for every variable that it changes.
-                alpha = wp.where(seen, alpha_of(log_alpha), 0.0)
-                weight = alpha * transmittance
-                bend = float(0.0)
+            if begin == sorted_end:
+                sorted_end = sort_entries(
+                    frame.lists.entries,
+                    frame.lists.owners,
+                    listed_range[0],
+                    begin,
+                    listed_range[1],
+                    frame.lists.parted,
+                    frame.lists.splats,
+                    frame.lists.slots,
+                )
+            splat = int(-1)
+            center = NOWHERE
+            if begin + thread < sorted_end:
+                splat = frame.lists.splats[begin + thread]
+            if splat >= 0:
+                center = load_row(frame.splats.centers, splat)
+                shape = load_row(frame.splats.shapes, splat)
+                limits = depth_limits(center, shape, frame.near)
+                slope = load_row(frame.splats.slopes, splat)
                 if wp.static(exact):
-                    bend = share_row(0, BEND, bit, wp.vec4())[0]
-                z = depth_at(drawn, drawn_shape, share_row(0, SLOPE, bit, wp.vec4()), bend, frame.near, offset)
-                total += share_channels(0, bit, channels, 0) * weight
-                depth += z * weight
-                weight_sum += weight
-                last = wp.where(seen, begin + bit, last)
-                nearer = seen and transmittance > MEDIAN
-                median_depth = wp.where(nearer, z, median_depth)
-                median = wp.where(nearer, begin + bit, median)
-                transmittance *= 1.0 - alpha
-            begin += LANES
-            if ballot(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) == 0:
+                    share_row(1, BEND, thread, wp.vec4(frame.splats.bends[splat], 0.0, limits[0], limits[1]))
+                else:
+                    slope = wp.vec4(slope[0], slope[1], limits[0], limits[1])
+                share_row(1, SHAPE, thread, shape)
+                share_row(1, SLOPE, thread, slope)
+                share_channels(1, thread, channels, splat)
+            share_row(1, CENTER, thread, center)
+            wait_for_block()
+            group = int(0)
+            while group < wp.min(sorted_end - begin, THREADS):
+                waiting = int(0)
+                if ballot(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) != 0:
+                    found = share_row(0, CENTER, group + lane, wp.vec4())
+                    waiting = ballot(reaches(found, share_row(0, SHAPE, group + lane, wp.vec4()), box, WIDTH, HEIGHT))
+                while waiting != 0:
+                    i = group + lowest_lane(waiting)
+                    waiting = waiting & (waiting - 1)
+                    drawn = share_row(0, CENTER, i, wp.vec4())
+                    drawn_shape = share_row(0, SHAPE, i, wp.vec4())
+                    offset = offset_from(drawn, place.position)
+                    log_alpha = log_alpha_of(drawn, whiten(drawn_shape, offset))
+                    seen = transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT
+                    if ballot(wp.where(seen, 1, 0)) == 0:
+                        continue
+                    # No branches from here on: each would cost a selection for every variable that it changes.
+                    alpha = wp.where(seen, alpha_of(log_alpha), 0.0)
+                    weight = alpha * transmittance
+                    slope = share_row(0, SLOPE, i, wp.vec4())
+                    bounds = slope
+                    if wp.static(exact):
+                        bounds = share_row(0, BEND, i, wp.vec4())
+                    z = depth_at(drawn[3], wp.vec2(bounds[2], bounds[3]), slope, bounds[0], offset)
+                    total += share_channels(0, i, channels, 0) * weight
+                    depth += z * weight
+                    weight_sum += weight
+                    last = wp.where(seen, begin + i, last)
+                    nearer = seen and transmittance > MEDIAN
+                    median_depth = wp.where(nearer, z, median_depth)
+                    median = wp.where(nearer, begin + i, median)
+                    transmittance *= 1.0 - alpha
+                group += LANES
+            begin = wp.min(begin + THREADS, sorted_end)
+            if any_of_block(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) == 0:
                 begin = listed_range[1]
         if pixel >= 0:
             gaussian = int(-1)
@@ -186,7 +199,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
             out_images.ends[pixel] = end
             out_images.medians[pixel] = median
 
-    return composite_warps_kernel
+    return composite_blocks_kernel
 
 
 def launch_composite_cuda(frame, channels, exact, out_channels, out_images, device):
@@ -197,5 +210,5 @@ def launch_composite_cuda(frame, channels, exact, out_channels, out_images, devi
         inputs=[frame, channels],
         outputs=[out_channels, out_images],
         device=device,
-        block_dim=32 * WARPS,
+        block_dim=THREADS,
     )

@@ -3,7 +3,7 @@
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
-from beam_warp.kernels.raster.bin_tiles import SplatOrder
+from beam_warp.kernels.raster.bin_tiles import SplatOrder, TileLists
 from beam_warp.kernels.raster.composite_adjoint import MOMENTS
 from beam_warp.kernels.raster.project import Splats
 
@@ -11,8 +11,10 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def sum_pairs_kernel(first: int, pair_rows: wp.array2d[float], order: SplatOrder, out_sums: wp.array2d[float]):
-    """Add one column of the rows of a splat's pairs, which lie side by side."""
+def sum_pairs_kernel(
+    first: int, pair_rows: wp.array2d[float], lists: TileLists, order: SplatOrder, out_sums: wp.array2d[float]
+):
+    """Add one column of the rows of a splat's pairs, which lie side by side; CUDA leaves out those that nobody saw."""
     item = first + wp.tid()
     length = pair_rows.shape[1]
     place = item / length
@@ -23,7 +25,8 @@ def sum_pairs_kernel(first: int, pair_rows: wp.array2d[float], order: SplatOrder
     total = float(0.0)
     # Ends beyond the range of integers come out negative: what was not listed has no rows.
     for row in range(wp.max(order.ends[place] - count, 0), wp.min(order.ends[place], pair_rows.shape[0])):
-        total += pair_rows[row, column]
+        if lists.summed.shape[0] == 0 or lists.summed[row] != wp.uint8(0):
+            total += pair_rows[row, column]
     splat = order.splats[place]
     out_sums[splat, column] = out_sums[splat, column] + total
 

@@ -75,7 +75,7 @@ class Splats:
     shapes: wp.array[wp.vec4]  # s0 = 1/sqrt(xx), s1 = xy/xx, s2 = sqrt(xx/det) of the filtered covariance; reach [m]
     slopes: wp.array[wp.vec4]  # l = 1 + gx dx + gy dy; e = exx dx^2 + 2 exy dx dy + eyy dy^2: gx, gy, exx, exy
     bends: wp.array[float]  # eyy
-    normals: wp.array[wp.vec3]  # unit, in the world, towards the camera: of the surface of largest response
+    normals: wp.array[wp.vec3]  # unit, in the world, towards the camera: of the surface of largest response; or none
 
 
 CameraMove = wp.types.vector(length=12, dtype=float)
@@ -207,7 +207,8 @@ def project_function(with_camera: bool):
         out_splats.shapes[splat] = wp.vec4(1.0 / wp.sqrt(xx), xy / xx, wp.sqrt(xx / det), DEPTH_REACH * largest)
         out_splats.slopes[splat] = wp.vec4(wp.dot(a, b0) / aa, wp.dot(a, b1) / aa, wp.dot(c0, c0), wp.dot(c0, c1))
         out_splats.bends[splat] = wp.dot(c1, c1)
-        out_splats.normals[splat] = wp.normalize(wp.transpose(view.world_to_camera) * normal)
+        if out_splats.normals.shape[0] > 0:
+            out_splats.normals[splat] = wp.normalize(wp.transpose(view.world_to_camera) * normal)
 
     return project
 
@@ -215,7 +216,7 @@ def project_function(with_camera: bool):
 project_still, project_moved = project_function(False), project_function(True)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def project_gaussians_kernel(
     first: int,
     positions: wp.array[wp.vec3],
@@ -231,7 +232,7 @@ def project_gaussians_kernel(
     project_still(splat, positions, orientations, scales, opacities, view, CameraMove(), projection, out_splats)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def project_with_cameras_kernel(
     first: int,
     positions: wp.array[wp.vec3],

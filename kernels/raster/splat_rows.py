@@ -1,5 +1,7 @@
 """One splat at one pixel: its response, its depth there, and which pixels of a row it reaches."""
 
+from functools import cache
+
 import warp as wp
 
 from beam_warp.kernels.common.constants import ALPHA_MAX
@@ -187,26 +189,35 @@ def bend_at(slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
 
 
 @wp.func
-def clamp_depth(center: wp.vec4, shape: wp.vec4, near: float, inverse: float) -> float:
-    """Depth of a centre over ``inverse``, kept where the Gaussian is."""
-    far = center[3] + shape[3]
-    depth = wp.where(inverse > 0.0, wp.min(quick_divide(center[3], inverse), far), far)
-    return wp.max(depth, wp.max(center[3] - shape[3], near))
+def depth_limits(center: wp.vec4, shape: wp.vec4, near: float) -> wp.vec2:
+    """Least and greatest depth of a Gaussian."""
+    return wp.vec2(wp.max(center[3] - shape[3], near), center[3] + shape[3])
 
 
-@wp.func
-def plane_depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2) -> float:
-    """Depth of the plane at an offset from the centre; beyond its horizon the far end. ``bend`` has no part in it."""
-    return clamp_depth(center, shape, near, facing_at(slope, offset))
+@cache
+def limited_depth_function(exact: bool):
+    """Return the function that gives a splat's depth at an offset from its centre, between its limits."""
+
+    @wp.func
+    def limited_depth_at(depth: float, limits: wp.vec2, slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
+        """Depth of the plane, beyond its horizon the far end; or in exact mode that of the largest response."""
+        inverse = facing_at(slope, offset)
+        if wp.static(exact):
+            facing = wp.max(inverse, SMALLEST_FACING)
+            inverse = facing + quick_divide(bend_at(slope, bend, offset), facing)
+        reached = wp.where(inverse > 0.0, wp.min(quick_divide(depth, inverse), limits[1]), limits[1])
+        return wp.max(reached, limits[0])
+
+    return limited_depth_at
 
 
-@wp.func
-def exact_depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2) -> float:
-    """Depth of the largest response on the ray at an offset from the centre."""
-    facing = wp.max(facing_at(slope, offset), SMALLEST_FACING)
-    return clamp_depth(center, shape, near, facing + quick_divide(bend_at(slope, bend, offset), facing))
-
-
+@cache
 def depth_function(exact: bool):
     """Return the function (center, shape, slope, bend, near, offset) that gives a splat's depth at a pixel."""
-    return exact_depth_at if exact else plane_depth_at
+    limited_depth_at = limited_depth_function(exact)
+
+    @wp.func
+    def depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2) -> float:
+        return limited_depth_at(center[3], depth_limits(center, shape, near), slope, bend, offset)
+
+    return depth_at

@@ -3,7 +3,6 @@
 import numpy as np
 import warp as wp
 
-from beam_warp.kernels.raster.bin_tiles import launch_order_tiles
 from beam_warp.kernels.raster.composite_cuda import HEIGHT, WIDTH, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import log_alpha_of, offset_from, whiten
@@ -54,16 +53,3 @@ def test_no_pixel_that_counts_is_passed_over(rng):
 def _turns(angle):
     """Cosine and sine of an angle, and the other way round."""
     return ((np.cos(angle), np.sin(angle)), (np.sin(angle), np.cos(angle)))
-
-
-def test_tiles_of_long_lists_are_drawn_first(rng):
-    """Each tile once, those above five times the mean before all others."""
-    lengths = np.where(rng.uniform(size=1000) < 0.05, 900, rng.integers(0, 60, 1000))
-    ends = np.cumsum(lengths)
-    ranges = wp.array(np.stack([ends - lengths, ends], axis=1), dtype=wp.vec2i, device="cpu")
-    counts, order = wp.zeros(2, dtype=int, device="cpu"), wp.zeros(1000, dtype=int, device="cpu")
-    launch_order_tiles(1000, ranges, wp.array(ends[-1:], dtype=int, device="cpu"), counts, order, "cpu")
-    assert sorted(order.numpy()) == list(range(1000))
-    long = lengths[order.numpy()] > 5 * lengths.mean()
-    assert long.sum() == counts.numpy()[0] > 0
-    assert long[: long.sum()].all()

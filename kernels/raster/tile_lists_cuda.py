@@ -1,0 +1,416 @@
+"""Lists of the splats that each tile draws on CUDA: count, plan, emit; each tile's block then sorts its own list.
+
+A pair of tile and splat is an entry of its tile: the splat's depth and the pair's slot in one number. Slots follow the
+order of the splats, so that equal depths keep that order. A block sorts the nearest entries of its tile first, and as
+many more as its pixels look at: where the front hides the rest, most of a long list is never sorted.
+
+Entries are emitted by atomics, in any order; once they are sorted nothing of it is left.
+"""
+
+import warp as wp
+
+from beam_warp.kernels.common.launching import launch, launcher
+from beam_warp.kernels.common.row_loads import load_row
+from beam_warp.kernels.raster.bin_tiles import Band, SplatOrder, TileLists, tile_box, tile_columns
+from beam_warp.kernels.raster.project import CameraMove, Projection, RasterView, Splats, project_still
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+SORTED = 1024
+"""Most entries that a block sorts at a time."""
+
+SPREAD = wp.constant(8)
+"""Numbers of a tile's tally: atomics on one sector of 32 bytes wait for each other. The first is that of its pairs."""
+
+EMITTED = wp.constant(4)
+"""Place in a tally of the number of pairs that were emitted."""
+
+FEW = 128
+"""Most entries of a list that are compared with each other, at most `THREADS`."""
+
+THREADS = wp.constant(256)
+"""Threads of the blocks that sort; each counts four bins of depth."""
+
+PLANNERS = 1024
+"""Threads of the block that plans."""
+
+NO_SLOT = wp.constant(wp.uint64(1 << 63))
+"""The bit of entries of pairs that have no slot; they come last."""
+
+
+@wp.func
+def count_entries(splat: int, splats: Splats, view: RasterView, band: Band, tallies: wp.array[int]) -> int:
+    """Number of a splat's pairs, each added to its tile's tally."""
+    center = splats.centers[splat]
+    count = int(0)
+    if center[2] > -wp.inf:
+        shape = splats.shapes[splat]
+        box = tile_box(center, shape, view, band)
+        for row in range(box[1], box[3]):
+            columns = tile_columns(center, shape, view, box, row)
+            tile = view.first_tile - band.first_tile + row * view.columns
+            for column in range(columns[0], columns[1]):
+                wp.atomic_add(tallies, (tile + column) * SPREAD, 1)
+            count += columns[1] - columns[0]
+    return count
+
+
+@wp.kernel
+def count_entries_kernel(
+    first: int,
+    splats: Splats,
+    views: wp.array[RasterView],
+    gaussian_count: int,
+    band: Band,
+    out_counts: wp.array[int],
+    out_tallies: wp.array[int],
+):
+    splat = first + wp.tid()
+    out_counts[splat] = count_entries(splat, splats, views[splat / gaussian_count], band, out_tallies)
+
+
+@wp.kernel
+def project_entries_kernel(
+    first: int,
+    positions: wp.array[wp.vec3],
+    orientations: wp.array[wp.quat],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    views: wp.array[RasterView],
+    projection: Projection,
+    band: Band,
+    out_splats: Splats,
+    out_counts: wp.array[int],
+    out_tallies: wp.array[int],
+):
+    """`kernels.raster.project` and counting in one: a frame of few Gaussians takes as long as its launches."""
+    splat = first + wp.tid()
+    view = views[splat / positions.shape[0]]
+    project_still(splat, positions, orientations, scales, opacities, view, CameraMove(), projection, out_splats)
+    out_counts[splat] = count_entries(splat, out_splats, view, band, out_tallies)
+
+
+@wp.kernel
+def emit_entries_kernel(
+    first: int,
+    order: SplatOrder,
+    splats: Splats,
+    views: wp.array[RasterView],
+    gaussian_count: int,
+    band: Band,
+    tallies: wp.array[int],
+    out_lists: TileLists,
+):
+    """Entries beyond a tile's room are left out; a pair without a slot, beyond the capacity, leaves a last entry."""
+    splat = first + wp.tid()
+    count = order.counts[splat]
+    if count <= 0:
+        return
+    end = wp.min(order.ends[splat], out_lists.owners.shape[0])
+    slot = order.ends[splat] - count
+    center = load_row(splats.centers, splat)
+    shape = load_row(splats.shapes, splat)
+    view = views[splat / gaussian_count]
+    box = tile_box(center, shape, view, band)
+    depth = wp.uint64(wp.cast(center[3], int)) << wp.uint64(32)  # bits of a positive float sort like an integer
+    for row in range(box[1], box[3]):
+        columns = tile_columns(center, shape, view, box, row)
+        for column in range(columns[0], columns[1]):
+            tile = view.first_tile - band.first_tile + row * view.columns + column
+            room = out_lists.ranges[tile]
+            place = room[0] + wp.atomic_add(tallies, tile * SPREAD + EMITTED, 1)
+            has_slot = slot >= 0 and slot < end
+            if has_slot:
+                out_lists.owners[slot] = splat
+            if place < room[1]:
+                out_lists.entries[place] = wp.where(has_slot, depth | wp.uint64(slot), NO_SLOT | wp.uint64(place))
+            slot += 1
+
+
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)
+    // Classes of lengths, four an octave; those of longer lists are drawn first, empty ones last.
+    __shared__ int places[128];
+    __shared__ unsigned long long sums[32];  // of each warp
+    const int thread = threadIdx.x, lane = thread & 31, warp = thread >> 5;
+    // A warp has a run of tiles. Above the 40 bits of a sum of lengths is the number of empty tiles.
+    const int each = (tile_count + blockDim.x - 1) / blockDim.x * 32;
+    const int first = min(warp * each, tile_count), end = min(first + each, tile_count);
+    typedef unsigned long long Sum;
+    #define CLASS(n) min(127, (int)(__float_as_uint((float)(n)) >> 21) - 507)
+    #define WEIGHT(n) ((n) > 0 ? (Sum)(n) : (Sum)1 << 40)
+    if (thread < 128)
+        places[thread] = 0;
+    __syncthreads();
+    Sum own = 0;
+    for (int i = first + lane; i < end; i += 32) {
+        const int length = tallies.data[i * SPREAD];
+        own += WEIGHT(length);
+        if (length > 0)
+            atomicAdd(places + CLASS(length), 1);
+    }
+    for (int step = 16; step > 0; step /= 2)
+        own += __shfl_xor_sync(0xffffffffu, own, step);
+    if (lane == 0)
+        sums[warp] = own;
+    __syncthreads();
+    Sum before = 0;
+    for (int i = 0; i < warp; ++i)
+        before += sums[i];
+    int longer = 0;
+    if (thread < 128)
+        for (int i = thread + 1; i < 128; ++i)
+            longer += places[i];
+    __syncthreads();
+    if (thread < 128)
+        places[thread] = longer;
+    __syncthreads();
+    for (int base = first; base < end; base += 32) {
+        const int i = base + lane;
+        const int length = i < end ? tallies.data[i * SPREAD] : 0;
+        Sum sum = WEIGHT(length);
+        for (int step = 1; step < 32; step *= 2) {
+            const Sum other = __shfl_up_sync(0xffffffffu, sum, step);
+            sum += lane >= step ? other : 0;
+        }
+        const Sum own_before = before + sum - WEIGHT(length);
+        const Sum start = own_before & (((Sum)1 << 40) - 1);
+        if (i < end) {
+            const bool fits = start + length <= capacity;
+            ranges.data[i] = wp::vec2i(fits ? (int)start : capacity, fits ? (int)start + length : capacity);
+            const int empty = (int)(own_before >> 40);
+            order.data[length > 0 ? atomicAdd(places + CLASS(length), 1) : tile_count - 1 - empty] = i;
+        }
+        before += __shfl_sync(0xffffffffu, sum, 31);
+    }
+    #undef WEIGHT
+    #undef CLASS
+#endif
+""".replace("SPREAD", str(SPREAD))
+)
+def plan_tiles(
+    tallies: wp.array[int], tile_count: int, capacity: int, ranges: wp.array[wp.vec2i], order: wp.array[int]
+):
+    """Places of the tiles' lists, one after the other, and the order in which tiles are drawn; by one block.
+
+    What begins last should not take longest: long lists lie where a surface is seen edge on. Tiles whose lists do not
+    fit have none.
+    """
+    ...
+
+
+@wp.kernel
+def plan_tiles_kernel(
+    first: int,
+    tallies: wp.array[int],
+    tile_count: int,
+    capacity: int,
+    out_ranges: wp.array[wp.vec2i],
+    out_order: wp.array[int],
+):
+    plan_tiles(tallies, tile_count, capacity, out_ranges, out_order)
+
+
+_SORT_ENTRIES = """
+#if defined(__CUDA_ARCH__)
+    typedef unsigned long long Entry;
+    __shared__ Entry held[SORTED];
+    __shared__ int bins[4 * THREADS];
+    __shared__ int parts[THREADS];  // ends of the parts of a long list
+    __shared__ Entry least[THREADS / 32], greatest[THREADS / 32];  // of each warp
+    __shared__ int sums[THREADS / 32];
+    __shared__ Entry bound;  // every entry of a part before it is listed
+    __shared__ int fitting, count;  // bins to be listed, and entries in them
+    const int thread = threadIdx.x, lane = thread & 31, warp = thread >> 5;
+    const Entry* from = reinterpret_cast<const Entry*>(entries.data);
+    Entry low, high;
+    int shift;
+    const auto visit = [&](auto look) {
+        for (int i = begin + thread; i < end; i += 4 * THREADS) {
+            Entry four[4];
+            #pragma unroll
+            for (int k = 0; k < 4; ++k)
+                four[k] = from[min(i + k * THREADS, end - 1)];
+            #pragma unroll
+            for (int k = 0; k < 4; ++k)
+                if (i + k * THREADS < end)
+                    look(four[k]);
+        }
+    };
+    const auto find_range = [&](Entry start) {
+        low = ~Entry(0);
+        high = 0;
+        visit([&](Entry entry) {
+            if (entry >= start) {
+                low = min(low, entry);
+                high = max(high, entry);
+            }
+        });
+        for (int step = 16; step > 0; step /= 2) {
+            low = min(low, __shfl_xor_sync(0xffffffffu, low, step));
+            high = max(high, __shfl_xor_sync(0xffffffffu, high, step));
+        }
+        if (lane == 0) {
+            least[warp] = low;
+            greatest[warp] = high;
+        }
+        __syncthreads();
+        for (int i = 0; i < THREADS / 32; ++i) {
+            low = min(low, least[i]);
+            high = max(high, greatest[i]);
+        }
+    };
+    const auto sum_before = [&](int own) {
+        int sum = own;
+        for (int step = 1; step < 32; step *= 2) {
+            const int other = __shfl_up_sync(0xffffffffu, sum, step);
+            sum += lane >= step ? other : 0;
+        }
+        if (lane == 31)
+            sums[warp] = sum;
+        __syncthreads();
+        for (int i = 0; i < warp; ++i)
+            sum += sums[i];
+        return sum - own;
+    };
+    const auto write = [&](int place, Entry entry) {
+        const int slot = (long long)entry < 0 ? -1 : (int)entry;
+        slots.data[listed + place] = slot;
+        splats.data[listed + place] = slot < 0 ? -1 : owners.data[slot];
+    };
+    const int length = end - begin;
+    if (length <= FEW) {
+        Entry entry = 0;
+        if (thread < length)
+            entry = held[thread] = from[begin + thread];
+        __syncthreads();
+        if (thread < length) {
+            int place = 0;
+            for (int k = 0; k < length; ++k)
+                place += held[k] < entry;
+            write(place, entry);
+        }
+        __syncthreads();
+        return end;
+    }
+    Entry start = 0;
+    if (length > SORTED) {
+        Entry* to = reinterpret_cast<Entry*>(parted.data);
+        if (listed == begin) {
+            find_range(0);
+            shift = max(0, 64 - __clzll(high - low) - 8);
+            parts[thread] = 0;
+            __syncthreads();
+            visit([&](Entry entry) { atomicAdd(parts + (int)((entry - low) >> shift), 1); });
+            __syncthreads();
+            parts[thread] = sum_before(parts[thread]);
+            __syncthreads();
+            visit([&](Entry entry) { to[begin + atomicAdd(parts + (int)((entry - low) >> shift), 1)] = entry; });
+            __syncthreads();
+        }
+        from = to;
+        const int done = listed - begin;
+        const int part = __syncthreads_count(parts[thread] <= done);
+        const int part_begin = part > 0 ? parts[part - 1] : 0;
+        const int fit = __syncthreads_count(parts[thread] <= part_begin + SORTED);
+        if (part_begin < done)
+            start = bound;
+        end = begin + parts[part_begin == done && fit > part ? fit - 1 : part];
+        begin += part_begin;
+    }
+    find_range(start);
+    // Narrow the range until its first bins hold few enough; no two entries are equal.
+    for (bool few = false; !few;) {
+        shift = max(0, 64 - __clzll(high - low) - 10);
+        int* four = bins + 4 * thread;
+        for (int k = 0; k < 4; ++k)
+            four[k] = 0;
+        __syncthreads();
+        visit([&](Entry entry) {
+            if (entry >= low && entry <= high)
+                atomicAdd(bins + (int)((entry - low) >> shift), 1);
+        });
+        __syncthreads();
+        int sum = sum_before(four[0] + four[1] + four[2] + four[3]);
+        for (int k = 0; k < 4; ++k) {
+            const int before = sum;
+            sum += four[k];
+            four[k] = before;
+            const bool is_last = thread == THREADS - 1 && k == 3;
+            if (before <= SORTED && (sum > SORTED || is_last)) {
+                fitting = 4 * thread + k + (sum <= SORTED);
+                count = sum <= SORTED ? sum : before;
+            }
+        }
+        __syncthreads();
+        few = fitting > 0;
+        if (fitting < 4 * THREADS)
+            high = min(high, low + ((Entry)max(fitting, 1) << shift) - 1);
+    }
+    visit([&](Entry entry) {
+        if (entry >= low && entry <= high)
+            held[atomicAdd(bins + (int)((entry - low) >> shift), 1)] = entry;
+    });
+    __syncthreads();
+    const int found = count;
+    if (thread == 0)
+        bound = high + 1;
+    for (int i = thread; i < found; i += THREADS) {
+        const Entry entry = held[i];
+        const int bin = (int)((entry - low) >> shift);
+        int place = bin > 0 ? bins[bin - 1] : 0;
+        const int bin_end = bins[bin];
+        for (int k = place; k < bin_end; ++k)
+            place += held[k] < entry;
+        write(place, entry);
+    }
+    __syncthreads();
+    return listed + found;
+#else
+    return end;
+#endif
+"""
+
+
+@wp.func_native(_SORT_ENTRIES.replace("SORTED", str(SORTED)).replace("FEW", str(FEW)).replace("THREADS", str(THREADS)))
+def sort_entries(
+    entries: wp.array[wp.uint64],
+    owners: wp.array[int],
+    begin: int,
+    listed: int,
+    end: int,
+    parted: wp.array[wp.uint64],
+    splats: wp.array[int],
+    slots: wp.array[int],
+) -> int:
+    """List the next entries of a tile in order, at most `SORTED`, after those ``listed``; return the new end.
+
+    ``begin`` and ``end`` are the tile's range; a long list is parted by depth first, into ``parted``. Entries of a part
+    are counted in bins, and those of a bin compared with each other. All threads of the block call it together.
+    """
+    ...
+
+
+launch_count_entries = launcher(count_entries_kernel)
+"""Count the pairs of every splat and, added to zeros, those of every tile of a band."""
+
+
+def launch_project_entries(gaussians, views, projection, band, splats, counts, tallies, device):
+    """Project every Gaussian into every view, and count as `launch_count_entries` does."""
+    inputs = [*gaussians, views, projection, band]
+    outputs = [splats, counts, tallies]
+    launch(project_entries_kernel, len(counts), inputs=inputs, outputs=outputs, device=device)
+
+
+def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
+    """Give every tile of a band its room and its turn."""
+    outputs = [lists.ranges, lists.order]
+    inputs = [tallies, tile_count, capacity]
+    launch(plan_tiles_kernel, PLANNERS, inputs=inputs, outputs=outputs, device=device, block_dim=PLANNERS)
+
+
+def launch_emit_entries(order, splats, views, gaussian_count, band, tallies, lists, device):
+    """Write the entries of all tiles of a band, and the owner of every slot."""
+    inputs = [order, splats, views, gaussian_count, band, tallies]
+    launch(emit_entries_kernel, len(splats.centers), inputs=inputs, outputs=[lists], device=device)
