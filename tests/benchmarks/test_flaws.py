@@ -148,6 +148,7 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
         case = {"capture": "walker", "flaw": flaw, "size": 1.0, "seed": seed}
         stops = {"light_stops": 0.5, "light_stops_injected": 0.25}
         found = {**stops, "exposure_spread": 0.1, "exposure_spread_injected": 0.2}
+        found |= {"falloff": 3.9, "falloff_injected": 4.0}
         errors = {key: {"within_1": 0.6, "within_2": 0.9} for key in ("base_color", "base_color_scaled", "roughness")}
         said = {"recovered": found, "errors": errors, "seconds": {"run": 7.0}, "named": {}, "beside": [], **more}
         return {"case": case, "scores": {**images, **numbers}, **said}
@@ -164,14 +165,13 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
     _, *others = tables_flaws.others({"rows": [*rows, row("flawed", 25.0)]}, {"rows": [row("noise", 29.0)]})
     assert [cells[1] for cells in others] == ["30.0 dB / 0.900", "21.0 dB / 0.900"]
     _, first, *_ = tables_flaws.recovered({"rows": rows})
-    assert first == ["nothing", "+0.50", "-0.25", "0.10", "0.20", *["60 %, 90 %"] * 3, "7"]
+    assert first == ["nothing", "+0.50", "-0.25", "0.10", "0.20", "3.9", "4.0", *["60 %, 90 %"] * 3, "7"]
 
 
 def test_what_was_refused_has_a_row():
     case = {"capture": "walker", "flaw": "masks", "size": 2.0, "seed": 0}
     rows = [{"case": case, "refused": "no", "named": {"masks": False}, "beside": []}]
-    for make in (tables_flaws.scores, tables_flaws.recovered):
-        head, cells = make({"rows": rows})
+    for head, cells in (tables_flaws.scores(rows), tables_flaws.recovered({"rows": rows})):
         assert len(cells) == len(head)
         assert cells[0].endswith("twice that")
 
