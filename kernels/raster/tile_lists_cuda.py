@@ -392,7 +392,7 @@ def sort_entries(
     ...
 
 
-launch_count_entries = launcher(count_entries_kernel)
+launch_count_entries = launcher(count_entries_kernel, in_order=True)
 """Count the pairs of every splat and, added to zeros, those of every tile of a band."""
 
 
@@ -400,7 +400,7 @@ def launch_project_entries(gaussians, views, projection, band, splats, counts, t
     """Project every Gaussian into every view, and count as `launch_count_entries` does."""
     inputs = [*gaussians, views, projection, band]
     outputs = [splats, counts, tallies]
-    launch(project_entries_kernel, len(counts), inputs=inputs, outputs=outputs, device=device)
+    launch(project_entries_kernel, len(counts), inputs=inputs, outputs=outputs, device=device, in_order=True)
 
 
 def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
@@ -413,4 +413,4 @@ def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
 def launch_emit_entries(order, splats, views, gaussian_count, band, tallies, lists, device):
     """Write the entries of all tiles of a band, and the owner of every slot."""
     inputs = [order, splats, views, gaussian_count, band, tallies]
-    launch(emit_entries_kernel, len(splats.centers), inputs=inputs, outputs=[lists], device=device)
+    launch(emit_entries_kernel, len(splats.centers), inputs=inputs, outputs=[lists], device=device, in_order=True)
