@@ -19,8 +19,8 @@ larger part of what a dark point shows: half of their difference is as large as 
 changes, half may be wrong. Exposures and white balances stay as they are unless they are beyond that, and exposures
 beyond what halves share as well (an F test of the mean squares), each on its own evidence. Then they shrink by what the
 error explains of them. So a sound capture stays as it is, to the bit. The mean over the cameras is held. The power of
-vignetting is judged likewise, and is not among the unknowns unless it is beyond doubt: 0 holds of lenses whose images
-were corrected.
+vignetting is one number, so it is judged by its error alone, and is not among the unknowns unless it is beyond doubt: 0
+holds of lenses whose images were corrected.
 
 Sources: empirical Bayes, Efron and Morris 1973; random effects, Laird and Ware 1982; Cauchy's weights, Holland and
 Welsch 1977; the split sum, Karis 2013; vignetting as a power of the cosine, the fourth for a thin lens, Horn 1986.
