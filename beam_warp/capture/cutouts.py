@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, gaussian_filter
 
-from beam_warp.capture.mattes import SOLID, moved_mask
+from beam_warp.capture.matte_edges import SOLID
+from beam_warp.capture.mattes import moved_mask
 from beam_warp.capture.views import CapturedView
 
 MOST_PIXELS = 3.0

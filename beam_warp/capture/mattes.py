@@ -8,7 +8,8 @@ length of the outline, is how far the mask reaches beyond the subject, whether t
 
 How much F and B scatter about their functions, and change over the pixels from which they are extrapolated, says how
 far to trust that. A mask is moved by what is beyond doubt alone: an exact one stays as it is, and where subject and
-backdrop look alike nothing is known. Most of what is wrong with a mask is so all along its outline; where a part of it
+backdrop look alike nothing is known. One that is wrong for sure, since it is moved, or all or nothing, or since another
+one explains the pixels better beyond doubt, is made as soft as the photograph's outline (`matte_edges`). Most of what is wrong with a mask is so all along its outline; where a part of it
 seems to be off by more, the mask may be wrong there, or the subject be dark towards its limb, before a dark backdrop.
 What is between the two outlines is told as a doubt, and left to other views. Then the most likely
 colours of subject and backdrop whose sum is the pixel (Chuang et al. 2001, "A Bayesian Approach to Digital Matting")
@@ -26,8 +27,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, map_coordinates, maximum_filter, minimum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
-SOLID = 0.5
-"""The outline runs where coverage passes this value."""
+from beam_warp.capture.matte_edges import AS_IT_IS, SOLID, Edge, EdgeEvidence
 
 MOST_POINTS = 2**17
 """Masks with more pixels along their outlines are left as they are: they are noise."""
@@ -179,17 +179,21 @@ def matte(
         outer = _fit(seen - empty, outline, place > margin, margin)
         outer.values += np.broadcast_to(empty, photograph.shape)[at]
         shown = _coverage(seen[at], inner.values, outer.values)
-        shown = np.where(np.abs(distance) <= margin, shown, distance < 0.0)
-        excess, error = _excess(outline, mask[at], shown, inner, outer)
-    offset, common, own = _believed(excess, error)
-    whole = _moved(mask, outline, np.full(len(own), common))
-    parts = _moved(mask, outline, common + own) if own.any() else whole
+        known = np.where(np.abs(distance) <= margin, shown, distance < 0.0)
+        excess, error = _excess(outline, mask[at], known, inner, outer)
+    offset, own = _believed(excess, error)
+    common, edge = 0.0, AS_IT_IS
+    contrast = np.square(inner.values - outer.values).sum(axis=1)
+    if offset is not None:
+        worth = contrast / (inner.variances + outer.variances)[outline.nearest]
+        common, edge = _mended(mask, outline, offset, EdgeEvidence(at, outline.distances, shown, worth))
+    whole = edge.redrawn(_moved_evenly(mask, outline, common), at)
+    parts = edge.redrawn(_moved(mask, outline, common + own), at) if own.any() else whole
     alpha = (0.5 * (whole + parts)).astype(np.float32)
     color = photograph * alpha[..., None]
     color[at] = _subject(seen[at], alpha[at], inner, outer, outline.nearest)
     uncut = None
-    if common != 0.0 or own.any():  # a mask that is right says more than colours do
-        contrast = np.square(inner.values - outer.values).sum(axis=1)
+    if common != 0.0 or own.any() or edge != AS_IT_IS:  # a mask that is right says more than colours do
         sure = 3.0 * outer.variances[outline.nearest] < BACKDROP_ERROR**2 * contrast
         known = tuple(outline.near[sure].T)
         scene, behind = color.copy(), np.zeros_like(color)
@@ -206,7 +210,7 @@ def moved_mask(mask: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
         pixels: How far, at most the 3 that are looked at around an outline [pixel].
     """
     outline = _outline(mask)
-    return mask if outline is None else _moved(mask, outline, np.full(len(outline.points), pixels))
+    return mask if outline is None else _moved_evenly(mask, outline, pixels)
 
 
 def keyed(photograph: NDArray[np.float32], plate: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -402,17 +406,36 @@ def _sharpened(coverage: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def _believed(
     excess: NDArray[np.float64], error: NDArray[np.float64]
-) -> tuple[MaskOffset | None, float, NDArray[np.float64]]:
-    """Return a mask's offset, by how much to take it in, and each point beside that: what is beyond doubt."""
+) -> tuple[MaskOffset | None, NDArray[np.float64]]:
+    """Return a mask's offset, and by how much more to take in each point: what is beyond doubt."""
     weights = 1.0 / error**2
     middle = _middle_of_most(excess, weights)
     spread = max(1.4826 * _median(np.abs(excess - middle), weights), _median(error, weights))
     independent = weights.sum() ** 2 / (weights**2).sum() / NEIGHBORS
     of_all = float(np.hypot(LEAST_ERROR, 1.2533 * spread / np.sqrt(max(independent, 1.0))))  # 1.2533: of a median
     if not of_all <= WORST_ERROR:
-        return None, 0.0, np.zeros_like(excess)
-    common = float(_beyond(np.array(middle), np.array(of_all), ALL_OF_A_MASK))
-    return MaskOffset(middle, of_all), common, _beyond(excess - middle, error, ALL_OF_A_PART)
+        return None, np.zeros_like(excess)
+    return MaskOffset(middle, of_all), _beyond(excess - middle, error, ALL_OF_A_PART)
+
+
+def _mended(
+    mask: NDArray[np.float32], outline: _Outline, offset: MaskOffset, evidence: EdgeEvidence
+) -> tuple[float, Edge]:
+    """Return by how much to take a mask in [pixel], and how to redraw its outline: neither, if it may be sound.
+
+    Source of the shrinkage: James and Stein 1961, its positive part.
+    """
+    pixels, error = offset.pixels, offset.error
+    coverage = mask[evidence.at]
+    is_hard = not ((coverage > FAINT) & (coverage < 1.0 - FAINT)).any()
+    _, better = evidence.best_edge(_moved_evenly(mask, outline, pixels), pixels)
+    if better > ALL_OF_A_MASK:  # it is not the photograph's coverage, so that no place is as likely as the one it has
+        common = pixels * max(1.0 - error**2 / max(pixels**2, 1e-12), 0.0)
+    else:
+        common = float(_beyond(np.array(pixels), np.array(error), ALL_OF_A_MASK))
+        if common == 0.0 and not is_hard:
+            return 0.0, AS_IT_IS
+    return common, evidence.best_edge(_moved_evenly(mask, outline, common), common)[0]
 
 
 def _middle_of_most(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
@@ -463,6 +486,10 @@ def _moved(mask: NDArray[np.float32], outline: _Outline, moves: NDArray[np.float
     )
     alpha[tuple(near.T)] = np.clip(map_coordinates(part, places, order=3, mode="nearest"), least, most)
     return alpha
+
+
+def _moved_evenly(mask: NDArray[np.float32], outline: _Outline, pixels: float) -> NDArray[np.float32]:
+    return _moved(mask, outline, np.full(len(outline.points), pixels))
 
 
 def _subject(

@@ -26,7 +26,8 @@ from scipy.ndimage import gaussian_gradient_magnitude, minimum_filter, uniform_f
 
 from beam_warp.capture.cutouts import FADES, MOST_PIXELS, Ring, ring_of, taken_in
 from beam_warp.capture.mask_corrections import MaskCorrections
-from beam_warp.capture.mattes import SOLID, MaskOffset
+from beam_warp.capture.matte_edges import SOLID
+from beam_warp.capture.mattes import MaskOffset
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import resolve_device
 from beam_warp.image.metrics import block_means

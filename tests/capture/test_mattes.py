@@ -30,6 +30,34 @@ def test_a_mask_is_moved_to_the_outline_of_a_disc(pixels, with_plate):
         assert found.uncut is None
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize(
+    ("made", "left"),
+    [
+        (lambda true: gaussian_filter(true, 1.2), 0.06),  # feathered
+        (lambda true: offset_coverage(true, 0.5), 0.1),  # interpolated as it was grown
+        (lambda true: offset_coverage(true, -0.5), 0.1),
+        (lambda true: np.where(true > 0.5, 1.0, 0.0), 0.5),  # its stairs are a quarter of a pixel off in the mean
+        (lambda true: np.where(offset_coverage(true, 1.0) > 0.5, 1.0, 0.0), 0.12),
+    ],
+)
+def test_a_mask_is_made_as_soft_as_the_photograph(made, left, noise):
+    true = disc()
+    mask = made(true.astype(np.float64)).astype(np.float32)
+    photograph = before(WALL, true) + np.random.default_rng(0).normal(0.0, noise, WALL.shape)
+    found = matte(photograph.astype(np.float32), mask)
+    assert np.abs(found.alpha - true).sum() < left * np.abs(mask - true).sum()
+    assert found.uncut is not None
+
+
+@pytest.mark.parametrize("blur", [0.7, 1.5])
+def test_a_mask_of_a_blurred_photograph_is_not_made_steeper_than_that(blur):
+    true = gaussian_filter(disc(), blur)
+    mask = gaussian_filter(disc(RADIUS + 1.0), blur)
+    found = matte(before(WALL, true), mask)
+    assert np.abs(found.alpha - true).sum() < 0.15 * np.abs(mask - true).sum()
+
+
 @pytest.mark.parametrize("pixels", [-1.0, 1.0])
 def test_a_photograph_is_the_subject_before_its_backdrop(pixels):
     """However wrong the mask is, the wall is known along the whole outline; far from it nothing is said."""

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.capture.capture import Capture, CaptureRecord
+from beam_warp.capture.matte_edges import SOLID
 from beam_warp.capture.rigs import meeting_point
 from beam_warp.checks import require_choice, require_number
 from beam_warp.demo.capture import replacing_folder, transforms_record
@@ -51,6 +52,7 @@ FLAWS: Mapping[str, str] = {
     "noise": "photon noise of 2 % at white, read noise of 0.2 %, 8-bit sRGB PNG",
     "plate": "photographs before a grey wall, with exact masks",
     "masks": "masks one pixel too large in half of the cameras, too small in the others, before a grey wall",
+    "hard-masks": "masks that are all or nothing, before a grey wall",
     "blots": "a hole and a blob, eight pixels across, in a quarter of the masks, before a grey wall",
     "cutouts": "cut-outs, colour over nothing, one pixel too large in half of the cameras, too small in the others",
     "poses": "poses off by 0.3 pixel of rotation and 1 mm",
@@ -99,7 +101,7 @@ def write_flawed(
         clean: A capture with coverage and the light that it was taken in.
         folder: Where to; made if its parent exists, and must be empty if it exists itself.
         flaws: Names of `FLAWS`; none writes the capture as it is.
-        size: Factor of the nominal sizes, above 0. ``plate`` has none.
+        size: Factor of the nominal sizes, above 0. ``plate`` and ``hard-masks`` have none.
         seed: Same seed, same flaws; each flaw's draws are the same alone and together with others.
         frames: Frames to write; None for all.
 
@@ -187,7 +189,7 @@ class _Shot:
     @property
     def is_photograph(self) -> bool:
         """Whether images show the wall, and masks lie beside them."""
-        return not self.flaws.isdisjoint(("plate", "masks", "blots", "jpeg"))
+        return not self.flaws.isdisjoint(("plate", "masks", "hard-masks", "blots", "jpeg"))
 
     @property
     def falloff(self) -> float:
@@ -225,6 +227,8 @@ class _Shot:
             wall = plate(alpha.shape, self.wall, stream(self.seed, "plate", record.camera_name))
             color = layers[..., :3] + (1.0 - alpha[..., None]) * wall
             coverage = self._blotted(offset_coverage(alpha, flaws.mask_pixels), record)
+            if "hard-masks" in self.flaws:
+                coverage = np.where(coverage > SOLID, 1.0, 0.0)
             write_png(paths["mask_path"], eight_bits(coverage))
         light = self._counted(color * flaws.gains * record.camera.axis_cosines()[..., None] ** self.falloff, record)
         if "jpeg" in self.flaws:
