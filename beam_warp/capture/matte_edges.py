@@ -97,5 +97,5 @@ def _softer(coverage: NDArray[np.float32], blur: float) -> NDArray[np.float32]:
     return gaussian_filter(coverage, blur, mode="nearest") if blur else coverage
 
 
-def _steeper(coverage: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
+def _steeper(coverage: NDArray[np.float32], gain: float) -> NDArray[np.floating]:
     return np.clip(SOLID + gain * (coverage - SOLID), 0.0, 1.0)

@@ -8,12 +8,14 @@ length of the outline, is how far the mask reaches beyond the subject, whether t
 
 How much F and B scatter about their functions, and change over the pixels from which they are extrapolated, says how
 far to trust that. A mask is moved by what is beyond doubt alone: an exact one stays as it is, and where subject and
-backdrop look alike nothing is known. One that is wrong for sure, since it is moved, or all or nothing, or since another
-one explains the pixels better beyond doubt, is made as soft as the photograph's outline (`matte_edges`). Most of what is wrong with a mask is so all along its outline; where a part of it
+backdrop look alike nothing is known. Most of what is wrong with a mask is so all along its outline; where a part of it
 seems to be off by more, the mask may be wrong there, or the subject be dark towards its limb, before a dark backdrop.
-What is between the two outlines is told as a doubt, and left to other views. Then the most likely
-colours of subject and backdrop whose sum is the pixel (Chuang et al. 2001, "A Bayesian Approach to Digital Matting")
-give the subject's part: I - (1 - a) B before a smooth backdrop, a F before a cluttered one.
+What is between the two outlines is told as a doubt, and left to other views. A mask that is wrong for sure is also made
+as soft as the photograph shows the outline (`matte_edges`): one that is moved, that is all or nothing, or that another
+softness explains better beyond doubt.
+
+Then the most likely colours of subject and backdrop whose sum is the pixel (Chuang et al. 2001, "A Bayesian Approach to
+Digital Matting") give the subject's part: I - (1 - a) B before a smooth backdrop, a F before a cluttered one.
 """
 
 from __future__ import annotations
@@ -404,9 +406,7 @@ def _sharpened(coverage: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.clip((coverage.astype(np.float64) - LITTLE) / (1.0 - 2.0 * LITTLE), 0.0, 1.0)
 
 
-def _believed(
-    excess: NDArray[np.float64], error: NDArray[np.float64]
-) -> tuple[MaskOffset | None, NDArray[np.float64]]:
+def _believed(excess: NDArray[np.float64], error: NDArray[np.float64]) -> tuple[MaskOffset | None, NDArray[np.float64]]:
     """Return a mask's offset, and by how much more to take in each point: what is beyond doubt."""
     weights = 1.0 / error**2
     middle = _middle_of_most(excess, weights)
