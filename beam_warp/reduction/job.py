@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number
@@ -23,6 +24,7 @@ from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reduction.changes import changed
+from beam_warp.reduction.errors import carried_errors
 from beam_warp.reduction.merging import MergeOrder
 from beam_warp.reduction.pilot import fast_enough, images_a_second, steps_within
 from beam_warp.reduction.refit import refit
@@ -43,6 +45,9 @@ GPU_STEPS, CPU_STEPS = 2880, 600
 
 SAMPLE_FRAMES = 4
 """Frames, evenly over a sequence, that sensitivities are measured in."""
+
+FIRST_SHARE = 0.15
+"""Share of the Gaussians that a first merge leaves. Its errors say where merging costs more than was foreseen."""
 
 ROUNDS, CLOSE = 6, 0.04
 """Candidates of a search at most, and how near to each other two numbers of Gaussians end it."""
@@ -252,11 +257,24 @@ class Reducer:
         lights = self.trials.draw("search", range(options.views, 3 * options.views), self._frames)
         how = {"raster": self.raster, "device": self._device, "progress": progress}
         self.sensitivity: Sensitivity = measure_sensitivity(original, self.trials, views, lights, **how)
-        self._order = MergeOrder(clouds, self.sensitivity, self._device)
+        order = MergeOrder(clouds, self.sensitivity, self._device)
+        self._order = MergeOrder(clouds, self.sensitivity, self._device, self._factors(order))
 
     def __len__(self) -> int:
         """Return the number of Gaussians of the original."""
         return len(self._reference)
+
+    def _factors(self, order: MergeOrder) -> NDArray[np.float64]:
+        """Return factors of what merging costs, by the errors of a first merge.
+
+        A Gaussian's factor is the mean of 1 and the error of its merged Gaussian over the average error: where a
+        merged Gaussian shows more error than others do, it should have been more than one.
+        """
+        labels = order.labels(max(1, round(FIRST_SHARE * len(self))))
+        clusters = Clusters(self._reference, labels, self.sensitivity.visible)
+        merged = {frame: clusters.cloud(cloud) for frame, cloud in zip(self._frames, self._clouds, strict=True)}
+        errors = carried_errors(merged, self.sensitivity, raster=self.raster, device=self._device)
+        return 0.5 + 0.5 * (errors / max(errors.mean(), 1e-30))[labels]
 
     def reduced(self, count: int, *, steps: int | None = None) -> GaussianSequence:
         """Return the asset of a number of Gaussians; frames are made as they are read.
