@@ -32,9 +32,7 @@ def carried_errors(
         raster: How splats are drawn.
         device: Warp device.
     """
-    uploaded = {
-        frame: upload_gaussians(cloud, device, values=material_rows(cloud)) for frame, cloud in frames.items()
-    }
+    uploaded = {frame: upload_gaussians(cloud, device, values=material_rows(cloud)) for frame, cloud in frames.items()}
     count = len(next(iter(frames.values())))
     cameras = [[view.camera] for view in found.views]
     drawer = Rasterizer(count, cameras[0], value_count=MATERIALS, options=raster, device=device)

@@ -35,7 +35,7 @@ def merged_by(order: MergeOrder, reducer: Reducer, count: int):
 
 
 def test_carried_errors_are_those_of_pixels_by_alpha(half_fine):
-    labels, cloud = merged_by(half_fine._order, half_fine, 200)
+    _, cloud = merged_by(half_fine._order, half_fine, 200)
     found = half_fine.sensitivity
     how = {"raster": half_fine.raster, "device": "cpu"}
     errors = carried_errors({0: cloud}, found, **how)
