@@ -30,6 +30,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,7 @@ from beam_warp.world.gaussians import GaussianCloud, GaussianSequence
 from beam_warp.world.harmonics import SH_C0
 
 Row = dict[str, Any]
+Judge = Callable[[GaussianCloud], Row]
 Keep = Callable[[Reducer, GaussianCloud, int, Path | None], GaussianCloud]
 
 FRESH, FRESH_PAIRS = 77, 200
@@ -212,48 +214,45 @@ CONTENDERS: dict[str, Keep] = {
 
 
 def sizes(bench: Bench) -> Iterator[Row]:
-    """Reduce every asset to every share by every contender."""
+    """Reduce every asset to every share by every contender; rivals wait until all assets have been reduced."""
     rows: list[Row] = []
-    for name in bench.assets:
-        original = asset(name, bench)
-        started = time.perf_counter()
-        reducer = Reducer(original, list(demo_environments().values()), bench.options)
-        measured = time.perf_counter() - started
-        comparison = RelitComparison(original, reducer.trials, raster=reducer.raster, device=bench.device)
-        draws = reducer.trials.draw("certificate", range(bench.tests), [0])
-        truth = against_truth(name, original, bench)
-
-        def judge(cloud: GaussianCloud, name: str = name, judged: Any = (comparison, draws, original, truth)) -> Row:
-            comparison, draws, original, truth = judged
-            one = replace(original, read_frame=lambda _: cloud)
-            psnr = comparison.errors(one, draws, keep=True).psnr
-            loss = loss_of(psnr) if truth is None else loss_of(psnr, truth)
-            said: Row = {"psnr": psnr.mean(), "loss": loss.mean(), "loss_95": np.quantile(loss, 0.95)}
-            return said if truth is None else said | {"truth_loss": truth - (against_truth(name, one, bench) or 0.0)}
-
-        cloud = change_axes(original[0], "rfu")
-        for contender, keep in CONTENDERS.items():
-            for share in bench.shares:
-                row: Row = {"name": f"{name} {share:g} {contender}", "asset": name, "share": share, "truth": truth}
-                row |= {"contender": contender, "original": len(cloud), "sensitivity_seconds": measured}
-                place = None if bench.made is None else bench.made / f"{name}_{share:g}.ply"
-                count = round(share * len(cloud))
-                try:
-                    rows.append(row | contend(keep, reducer, cloud, count, place, judge))
-                except (npm_packages.MissingPackagesError, subprocess.SubprocessError, BeamError) as error:
-                    rows.append(row | {"absent": str(error)})
-                say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
-                yield {"rows": rows, "height": bench.options.height, "tests": bench.tests}
+    subjects = [subject(name, bench) for name in bench.assets]
+    for contender, keep in CONTENDERS.items():
+        for (known, reducer, cloud, judge), share in product(subjects, bench.shares):
+            name = known["asset"]
+            row: Row = {"name": f"{name} {share:g} {contender}", "share": share, "contender": contender, **known}
+            place = None if bench.made is None else bench.made / f"{name}_{share:g}.ply"
+            try:
+                rows.append(row | contend(keep, reducer, cloud, round(share * len(cloud)), place, judge))
+            except (npm_packages.MissingPackagesError, subprocess.SubprocessError, BeamError) as error:
+                rows.append(row | {"absent": str(error)})
+            say(f"{rows[-1]['name']}: {rows[-1].get('bare')} {rows[-1].get('refit')}")
+            yield {"rows": rows, "height": bench.options.height, "tests": bench.tests}
 
 
-def contend(
-    keep: Keep,
-    reducer: Reducer,
-    cloud: GaussianCloud,
-    count: int,
-    place: Path | None,
-    judge: Callable[[GaussianCloud], Row],
-) -> Row:
+def subject(name: str, bench: Bench) -> tuple[Row, Reducer, GaussianCloud, Judge]:
+    """Return what is known of an asset, its reducer, its Gaussians, and a function that judges others beside them."""
+    original = asset(name, bench)
+    started = time.perf_counter()
+    reducer = Reducer(original, list(demo_environments().values()), bench.options)
+    measured = time.perf_counter() - started
+    comparison = RelitComparison(original, reducer.trials, raster=reducer.raster, device=bench.device)
+    draws = reducer.trials.draw("certificate", range(bench.tests), [0])
+    truth = against_truth(name, original, bench)
+
+    def judge(cloud: GaussianCloud) -> Row:
+        one = replace(original, read_frame=lambda _: cloud)
+        psnr = comparison.errors(one, draws, keep=True).psnr
+        loss = loss_of(psnr) if truth is None else loss_of(psnr, truth)
+        said: Row = {"psnr": psnr.mean(), "loss": loss.mean(), "loss_95": np.quantile(loss, 0.95)}
+        return said if truth is None else said | {"truth_loss": truth - (against_truth(name, one, bench) or 0.0)}
+
+    cloud = change_axes(original[0], "rfu")
+    known: Row = {"asset": name, "truth": truth, "original": len(cloud), "sensitivity_seconds": measured}
+    return known, reducer, cloud, judge
+
+
+def contend(keep: Keep, reducer: Reducer, cloud: GaussianCloud, count: int, place: Path | None, judge: Judge) -> Row:
     """Measure one contender, as it is and refitted."""
     started = time.perf_counter()
     bare = keep(reducer, cloud, count, place)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number
@@ -22,7 +23,8 @@ from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, require_flip, 
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reduction.changes import changed
+from beam_warp.reduction.changes import Changes, changed
+from beam_warp.reduction.errors import carried_errors
 from beam_warp.reduction.merging import MergeOrder
 from beam_warp.reduction.pilot import fast_enough, images_a_second, steps_within
 from beam_warp.reduction.refit import refit
@@ -43,6 +45,13 @@ GPU_STEPS, CPU_STEPS = 2880, 600
 
 SAMPLE_FRAMES = 4
 """Frames, evenly over a sequence, that sensitivities are measured in."""
+
+FIRST_SHARE, FIRST_STEPS = 0.15, 0.25
+"""Share of the Gaussians that a first merge leaves, and of the steps of a refit that it gets before its errors are
+measured: what a refit mends, such as outlines and holes, needs no more Gaussians."""
+
+LEAST_ERROR = 0.01
+"""Error of a merged Gaussian over the average error that is taken at least, so that nothing merges for free."""
 
 ROUNDS, CLOSE = 6, 0.04
 """Candidates of a search at most, and how near to each other two numbers of Gaussians end it."""
@@ -253,10 +262,26 @@ class Reducer:
         how = {"raster": self.raster, "device": self._device, "progress": progress}
         self.sensitivity: Sensitivity = measure_sensitivity(original, self.trials, views, lights, **how)
         self._order = MergeOrder(clouds, self.sensitivity, self._device)
+        self._order = MergeOrder(clouds, self.sensitivity, self._device, self._factors())
 
     def __len__(self) -> int:
         """Return the number of Gaussians of the original."""
         return len(self._reference)
+
+    def _factors(self) -> NDArray[np.float64]:
+        """Return factors of what merging costs, ``(N,)``, by the errors of a first merge.
+
+        Costs foresee errors only roughly. Where a merged Gaussian still shows more error than others do after some
+        steps of a refit, it should have been more than one. The factor is the root of the error over the average error:
+        its geometric mean with what was foreseen.
+        """
+        clusters, changes = self._refitted(max(1, round(FIRST_SHARE * len(self))), round(FIRST_STEPS * self.steps))
+        fitted = {
+            frame: changed(clusters.cloud(cloud), clusters.motion(cloud)[0], changes)
+            for frame, cloud in zip(self._frames, self._clouds, strict=True)
+        }
+        errors = carried_errors(fitted, self.sensitivity, raster=self.raster, device=self._device)
+        return np.sqrt(np.maximum(errors / max(errors.mean(), 1e-30), LEAST_ERROR))[clusters.labels]
 
     def reduced(self, count: int, *, steps: int | None = None) -> GaussianSequence:
         """Return the asset of a number of Gaussians; frames are made as they are read.
@@ -267,14 +292,7 @@ class Reducer:
         """
         if count >= len(self):
             return replace(self.original, read_frame=lambda frame: world(self.original, frame))
-        clusters = Clusters(self._reference, self._order.labels(count), self.sensitivity.visible)
-        merged = {
-            frame: (clusters.cloud(cloud), clusters.motion(cloud)[0])
-            for frame, cloud in zip(self._frames, self._clouds, strict=True)
-        }
-        number = self.steps if steps is None else steps
-        how = {"raster": self.raster, "device": self._device, "progress": self._progress}
-        changes = refit(merged, self.sensitivity, steps=number, **how)
+        clusters, changes = self._refitted(count, self.steps if steps is None else steps)
 
         @lru_cache(SAMPLE_FRAMES)
         def read(frame: int) -> GaussianCloud:
@@ -283,6 +301,16 @@ class Reducer:
 
         constant = self.original.constant if len(self.original) > 1 else frozenset()
         return replace(self.original, read_frame=read, constant=constant)
+
+    def _refitted(self, count: int, steps: int) -> tuple[Clusters, Changes]:
+        """Return clusters of a number, and what a refit of so many steps changes of them."""
+        clusters = Clusters(self._reference, self._order.labels(count), self.sensitivity.visible)
+        merged = {
+            frame: (clusters.cloud(cloud), clusters.motion(cloud)[0])
+            for frame, cloud in zip(self._frames, self._clouds, strict=True)
+        }
+        how = {"raster": self.raster, "device": self._device, "progress": self._progress}
+        return clusters, refit(merged, self.sensitivity, steps=steps, **how)
 
 
 def reduce_asset(

@@ -28,6 +28,9 @@ RATES = {"shift": 0.025, "turn": 0.005, "stretch": 0.01, "logit": 0.025, "materi
 LAST = 0.05
 """Share of the rates that is left at last; they fall by the same factor in every step."""
 
+FORGETTING = 0.99
+"""Decay of Adam's mean squared gradients: what it is usually, 0.999, remembers the large ones of the first steps."""
+
 RATED_EVERY = 10
 """Steps between changes of the rates."""
 
@@ -57,7 +60,8 @@ def refit(
     work = _Refit(frames, found, raster, device)
     rates = RATES | {"shift": RATES["shift"] * float(np.median(np.sort(some.scales, axis=1)[:, 1]))}
     pairs = zip(MOVED, work.changes, work.slopes, strict=True)
-    adam = Adam({name: Parameters(values, slopes, rates[name]) for name, values, slopes in pairs})
+    groups = {name: Parameters(values, slopes, rates[name]) for name, values, slopes in pairs}
+    adam = Adam(groups, beta2=FORGETTING)
     graphs = StepGraphs(resolve_device(device))
 
     def take(view: int) -> None:
