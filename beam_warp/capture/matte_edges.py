@@ -93,9 +93,9 @@ def _misfit(shown: NDArray[np.float64], coverage: NDArray[np.floating]) -> NDArr
     return np.minimum(np.square(shown - coverage), UNLIKE**2)
 
 
-def _softer(coverage: NDArray[np.float32], blur: float) -> NDArray[np.float32]:
+def _softer(coverage: NDArray[np.float32], blur: float) -> NDArray[np.floating]:
     return gaussian_filter(coverage, blur, mode="nearest") if blur else coverage
 
 
-def _steeper(coverage: NDArray[np.float32], gain: float) -> NDArray[np.floating]:
+def _steeper(coverage: NDArray[np.floating], gain: float) -> NDArray[np.floating]:
     return np.clip(SOLID + gain * (coverage - SOLID), 0.0, 1.0)
