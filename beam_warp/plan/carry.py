@@ -167,7 +167,8 @@ def _as_record(plan: Plan) -> dict[str, Any]:
 
 def _hand_out(job: _Job) -> None:
     """Give steps to idle workers."""
-    for worker in job.workers.idle():
+    job.schedule.workers = job.workers.count  # which changes in a cluster
+    for worker in sorted(job.workers.idle(), key=lambda it: not _has_read_ahead(job, it)):
         step = job.schedule.next(job.following.get(worker, ()))
         if step is None:
             return
@@ -178,6 +179,11 @@ def _hand_out(job: _Job) -> None:
         task = Task(step, keys, awaited, following, facts)
         job.running[step.name] = _Running(worker, job.workers.now())
         job.workers.start(worker, task)
+
+
+def _has_read_ahead(job: _Job, worker: str) -> bool:
+    """Return whether a worker has read ahead for a step that is ready, so that it should choose before others."""
+    return any(job.schedule.states[step.name] is State.READY for step in job.following.get(worker, ()))
 
 
 def _take(job: _Job, outcome: Outcome, watch: Watch) -> None:

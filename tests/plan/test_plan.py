@@ -74,6 +74,24 @@ class TestOrder:
             *("frame-2", "materials-2", "frame-3", "materials-3"),
         ]
 
+    def test_a_segment_goes_on_first_where_another_worker_can_finish_its_frames(self, tmp_path):
+        schedule, begun = Schedule(toy_plan(tmp_path, 6, 6).steps, workers=2), []
+        while (step := schedule.next()) is not None:
+            if 1 <= len(begun) <= 5:
+                assert schedule.likely_after(step)[0].name == f"frame-{len(begun)}"
+            begun.append(step.name)
+            schedule.done(step.name)
+        assert begun[:7] == ["cameras", *(f"frame-{frame}" for frame in range(6))]
+        assert begun[7:] == ["light", *(f"materials-{frame}" for frame in range(6))]
+
+    def test_frames_are_finished_first_where_every_worker_has_a_segment(self, tmp_path):
+        schedule = Schedule(toy_plan(tmp_path, 4, 2).steps, workers=2)
+        assert schedule.next().name == "cameras"
+        schedule.done("cameras")
+        assert [schedule.next().name for _ in range(2)] == ["frame-0", "frame-2"]
+        schedule.done("frame-0")
+        assert schedule.next().name == "light"
+
     def test_what_is_likely_next_is_next(self, tmp_path):
         schedule, guessed = Schedule(toy_plan(tmp_path, 6, 3).steps), []
         while (step := schedule.next()) is not None:
