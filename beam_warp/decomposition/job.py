@@ -35,16 +35,13 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.jobs.report import REPORT_NAME, write_report
 from beam_warp.plan.carry import Counted, carry_out
-from beam_warp.plan.steps import Receipt
+from beam_warp.plan.steps import Plan, Receipt
 from beam_warp.plan.workers import Crew, in_process
 from beam_warp.reconstruction.job import Reconstruction, ReconstructionWork
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
 OVERVIEW_NAME = "overview.png"
-
-LATE = ("trimesh", "scipy.interpolate", "beam_warp.converters.usd")
-"""Modules that a take can start without, but that take long to import: of previews, of roughness, of the asset."""
 
 COUNTED = {"materials": "decompose"}
 """Stages that a listener hears of when a step is done, and what they are called."""
@@ -172,20 +169,20 @@ def run_capture(
     """
     with closing(frames):
         notes = _prepare(work)
-        _import_ahead()
         plan = work.plan().with_steps_of(frames.plan())
+        _import_ahead(plan)
         watch = Counted(plan, {"frame": "frames", **COUNTED}, work.progress)
         receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
-        found = frames.finish(receipts, started, work.progress)
+        found = frames.finish(receipts, started)
         return TakeResult(found, _finish(work, receipts, notes, overview or OverviewOptions(), started))
 
 
-def _import_ahead() -> None:
+def _import_ahead(plan: Plan) -> None:
     """Import what later steps and the end need, while the first ones wait for the device."""
 
     def load() -> None:
         with suppress(ImportError):  # whoever needs it says so
-            for name in LATE:
+            for name in (name for work in plan.works.values() for name in work.later):
                 import_module(name)
 
     Thread(target=load).start()
@@ -222,7 +219,8 @@ def _finish(
         with ThreadPoolExecutor(1) as beside:
             drawn = beside.submit(draw)
             with log.timer("write asset"):
-                layers = work.clips.write(relightable, staged / ASSET_NAME, receipts)
+                said = {name: receipt.facts for name, receipt in receipts.items()}
+                layers = work.clips.write(relightable, staged / ASSET_NAME, said)
             drawn.result()
         work.progress("overview", 1, 1)
         seconds = time.perf_counter() - started

@@ -73,6 +73,7 @@ class MaterialWork:
         written: How the asset is written.
     """
 
+    later = ("scipy.interpolate",)  # of roughness
     folder: Path
     frames: Frames
     environment: EnvironmentMap
