@@ -23,6 +23,8 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import warp as wp
+
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_path
 from beam_warp.converters.numbering import ASSET_NAME
@@ -42,6 +44,9 @@ from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
 OVERVIEW_NAME = "overview.png"
+
+LAST = "beam_warp.render.sheet"
+"""Module with renderers, which the end needs and no step."""
 
 COUNTED = {"materials": "decompose"}
 """Stages that a listener hears of when a step is done, and what they are called."""
@@ -170,20 +175,21 @@ def run_capture(
     with closing(frames):
         notes = _prepare(work)
         plan = work.plan().with_steps_of(frames.plan())
-        _import_ahead(plan)
+        _import_ahead(plan, work.device)
         watch = Counted(plan, {"frame": "frames", **COUNTED}, work.progress)
         receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
         found = frames.finish(receipts, started)
         return TakeResult(found, _finish(work, receipts, notes, overview or OverviewOptions(), started))
 
 
-def _import_ahead(plan: Plan) -> None:
-    """Import what later steps and the end need, while the first ones wait for the device."""
+def _import_ahead(plan: Plan, device: Any) -> None:
+    """Import what later steps and the end need, and start the device, while the first steps wait or others do them."""
 
     def load() -> None:
         with suppress(ImportError):  # whoever needs it says so
-            for name in (name for work in plan.works.values() for name in work.later):
+            for name in (LAST, *(name for work in plan.works.values() for name in work.later)):
                 import_module(name)
+        wp.synchronize_device(device)
 
     Thread(target=load).start()
 

@@ -115,7 +115,7 @@ class MaterialWork:
             first: tuple[str, ...] = ()
             for index in self._asked:
                 inputs = ("light", *made[index], *first)
-                steps.append(Step(profile_step(numbers[index]), "profile", numbers[index], inputs, Rank.MATERIALS))
+                steps.append(Step(profile_step(numbers[index]), "profile", numbers[index], inputs, Rank.SHARED))
                 first = first or (profile_step(numbers[index]),)  # whose pilot says whether the others are asked
             inputs = (*(profile_step(numbers[index]) for index in self._asked), *(it for names in made for it in names))
             steps.append(Step("roughness", "roughness", None, inputs, Rank.SHARED))

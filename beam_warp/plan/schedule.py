@@ -92,15 +92,18 @@ class Schedule:
         """Whether nothing can be done any more."""
         return not any(self.counts[state] for state in IN_WORK)
 
-    def next(self, preferred: Iterable[Step] = ()) -> Step | None:
-        """Take the step to be done next; None where all that is left waits for others.
+    def next(self) -> Step | None:
+        """Take the step to be done next; None where all that is left waits for others."""
+        first = self.first()
+        return None if first is None else self.take(first)
+
+    def take(self, first: Step, preferred: Iterable[Step] = ()) -> Step:
+        """Take the most urgent step, or another one that is as urgent.
 
         Args:
-            preferred: Steps that the worker has read ahead for: taken first, unless others are more urgent.
+            first: What `first` returns.
+            preferred: Steps that the worker has read ahead for.
         """
-        first = self._first()
-        if first is None:
-            return None
         ahead = (step for step in preferred if self.states[step.name] is State.READY and step.rank == first.rank)
         step = next(ahead, first)
         self._set(step.name, State.RUNNING)
@@ -109,12 +112,12 @@ class Schedule:
     def likely_after(self, step: Step) -> tuple[Step, ...]:
         """Return the steps that are likely to follow a running one: what waits for it alone, and one of the others."""
         freed = [self.steps[name] for name in self._dependents[step.name] if self._open[name] == 1]
-        other = self._first()
+        other = self.first()
         found = freed if other is None else [*freed, other]
         return tuple(sorted(found, key=lambda it: (-self._urgency(it), self._order[it.name]))[:LIKELY])
 
-    def _first(self) -> Step | None:
-        """Return the most urgent step that is ready."""
+    def first(self) -> Step | None:
+        """Return the most urgent step that is ready; None where there is none."""
         firsts = []
         for heap in self._ready.values():
             while heap and self.states[heap[0][1]] is not State.READY:

@@ -103,8 +103,8 @@ class TestOrder:
     def test_a_worker_goes_on_with_what_it_has_read_unless_frames_can_be_finished(self):
         schedule = Schedule([Step("a", "s", 0, (), 1), Step("b", "s", 1, (), 1), Step("c", "s", 2, (), 2)])
         ahead = (schedule.steps["b"],)
-        assert [schedule.next(ahead).name for _ in range(3)] == ["c", "b", "a"]
-        assert schedule.next(ahead) is None
+        assert [schedule.take(schedule.first(), ahead).name for _ in range(3)] == ["c", "b", "a"]
+        assert schedule.first() is None
 
     @pytest.mark.parametrize("steps", [[Step("a", "s"), Step("a", "s")], [Step("a", "s", None, ("b",))]])
     def test_graphs_that_are_none(self, steps):
@@ -295,6 +295,13 @@ class TestProcesses:
         carry_out(plan, workers, harm, Patience(1.0, 1.0, 1.0))
         assert outputs(tmp_path) == whole
         assert [error for error in heard if error] == [next(error for error in heard if says in error)]
+
+    def test_who_is_at_a_segment_goes_on_and_the_other_one_does_the_rest(self, tmp_path):
+        plan = toy_plan(tmp_path, 12, 12, seconds=0.1)
+        receipts = carry_out(plan, processes(plan))
+        assert len({receipts[f"frame-{frame}"].worker for frame in range(12)}) == 1
+        last = max(receipts[f"frame-{frame}"].ended for frame in range(12))
+        assert sum(receipts[f"materials-{frame}"].ended < last for frame in range(12)) >= 6
 
     def test_work_that_cannot_be_sent(self, tmp_path):
         plan = toy_plan(tmp_path, 1, faults={"frame-0": lambda: None})
