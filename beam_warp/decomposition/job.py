@@ -14,16 +14,14 @@ continues. What they find is kept in a folder (`beam_warp.decomposition.archive`
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from threading import Thread
+from threading import Timer
 from typing import Any
-
-import warp as wp
 
 from beam_warp.capture.capture import Capture
 from beam_warp.checks import require_path
@@ -47,6 +45,10 @@ OVERVIEW_NAME = "overview.png"
 
 LAST = "beam_warp.render.sheet"
 """Module with renderers, which the end needs and no step."""
+
+AHEAD_AFTER = 2.5
+"""Time after which modules for later are imported [s]: the first fit has begun by then, which waits for the device, and
+what is done before does not."""
 
 COUNTED = {"materials": "decompose"}
 """Stages that a listener hears of when a step is done, and what they are called."""
@@ -175,23 +177,29 @@ def run_capture(
     with closing(frames):
         notes = _prepare(work)
         plan = work.plan().with_steps_of(frames.plan())
-        _import_ahead(plan, work.device)
         watch = Counted(plan, {"frame": "frames", **COUNTED}, work.progress)
-        receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
+        with _importing_ahead(plan, work.device):
+            receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
         found = frames.finish(receipts, started)
         return TakeResult(found, _finish(work, receipts, notes, overview or OverviewOptions(), started))
 
 
-def _import_ahead(plan: Plan, device: Any) -> None:
-    """Import what later steps and the end need, and start the device, while the first steps wait or others do them."""
+@contextmanager
+def _importing_ahead(plan: Plan, device: Any) -> Iterator[None]:
+    """Import what later steps and the end need, and start the device, while steps wait for it or others do them."""
 
     def load() -> None:
         with suppress(ImportError):  # whoever needs it says so
             for name in (LAST, *(name for work in plan.works.values() for name in work.later)):
                 import_module(name)
-        wp.synchronize_device(device)
+        _ = device.context
 
-    Thread(target=load).start()
+    timer = Timer(AHEAD_AFTER, load)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _prepare(work: MaterialWork) -> list[str]:

@@ -62,16 +62,16 @@ def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
 
 
 def test_processes_share_roughness(ball, tmp_path):
-    """Each frame says what it knows of roughness in a step of its own; one adds all up, to the same bytes."""
+    """While one tracks, the other one measures what frames say of roughness; a step adds all up, to the same bytes."""
     options = RunOptions(materials=MaterialOptions(sample_count=8), roughness="estimate", device="cpu")
     one = take(ball, tmp_path / "one", FakeSteps(), 0, options=options)
-    two = take(ball, tmp_path / "two", FakeSteps(), 0, crew_of("2", "cpu"), options)
+    two = take(ball, tmp_path / "two", FakeSteps(seconds=3.0), 0, crew_of("2", "cpu"), options)
     assert results(tmp_path / "one") == results(tmp_path / "two")
     assert one.result.report["roughness"] == two.result.report["roughness"]
     receipts = look(tmp_path / "two").receipts
-    workers = {receipts[f"profile-{frame:06d}"].worker for frame in (2, 3, 4, 5)}
-    assert workers == set(two.result.report["workers"])
-    assert len(workers) == 2
+    tracking, measuring = ({receipts[f"{it}-{frame:06d}"].worker for frame in (3, 4)} for it in ("frame", "profile"))
+    assert tracking.isdisjoint(measuring)
+    assert receipts["profile-000003"].ended < receipts["frame-000005"].ended
     assert look(tmp_path / "two").stages["profile"].total == 4
     assert look(tmp_path / "two").stages["roughness"].total == 1
 
