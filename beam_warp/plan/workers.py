@@ -384,6 +384,7 @@ def _serve(link: Any, setting: Mapping[str, str]) -> None:
         return
     link.send(None)
     gc.freeze()  # what the server has imported is never garbage, and need not be looked at again and again
+    gc.set_threshold(5_000)  # as in a command's own process
     later = [name for work in works.values() for name in work.later]
     while True:
         try:
