@@ -43,9 +43,6 @@ from beam_warp.world.gaussians import GaussianSequence
 
 OVERVIEW_NAME = "overview.png"
 
-LAST = "beam_warp.render.sheet"
-"""Module with renderers, which the end needs and no step."""
-
 AHEAD_AFTER = 2.5
 """Time after which modules for later are imported [s]: the first fit has begun by then, which waits for the device, and
 what is done before does not."""
@@ -190,7 +187,7 @@ def _importing_ahead(plan: Plan, device: Any) -> Iterator[None]:
 
     def load() -> None:
         with suppress(ImportError):  # whoever needs it says so
-            for name in (LAST, *(name for work in plan.works.values() for name in work.later)):
+            for name in (name for work in plan.works.values() for name in work.later):
                 import_module(name)
         _ = device.context
 
