@@ -312,7 +312,9 @@ def roughness_row(name: str, seen: list[SimpleNamespace], light: PreparedEnviron
     )
     order = roughness_finder.asked_frames(len(seen))
     started = time.process_time()
-    found = roughness_finder.find_roughness(plan, (seen[place] for place in order), len(seen))  # type: ignore[arg-type]
+    asked = (seen[place] for place in order)
+    profiles = roughness_finder.profiles_of(plan, asked, len(seen))  # type: ignore[arg-type]
+    found = roughness_finder.find_roughness(seen[order[0]].cloud.positions, profiles, len(seen))
     told = {key: found.report[key] for key in ("frames", "left_out_change", "informed_part")}
     stated = root_mean_square(found.standard_error)
     return {"name": name, "found": found, "seconds": time.process_time() - started, "stated": stated} | told

@@ -99,7 +99,9 @@ class Bench:
 
             receipts = carry_out(plan, InProcess(plan.works, no_progress), count)
             began = time.process_time()
-            layers = clips.write(sequence, folder / "asset.usda", receipts)
+            layers = clips.write(
+                sequence, folder / "asset.usda", {name: receipt.facts for name, receipt in receipts.items()}
+            )
             return {
                 "survey": spent["asset-survey"] / self.written,
                 "clip": spent["asset-clip"] / self.written,
@@ -223,6 +225,7 @@ def takes(bench: Bench) -> Iterator[Row]:
 class Naps:
     """Work whose steps sleep."""
 
+    later = ()
     folder: Path
     seconds: Mapping[str, float] = field(default_factory=dict)
 

@@ -25,7 +25,7 @@ from beam_warp.converters.common.options import WriteOptions
 from beam_warp.digests import code_digest
 from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.outputs import replacing
-from beam_warp.plan.steps import Plan, Rank, Receipt, Step, Task
+from beam_warp.plan.steps import Plan, Rank, Step, Task
 from beam_warp.schema.clips import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER, clip_name
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -51,6 +51,7 @@ class ClipWork:
         options: How the asset is written. One with keys has no steps: what varies is told beside its first frame.
     """
 
+    later = ("beam_warp.converters.usd",)
     folder: Path
     stem: str
     read: Callable[[], GaussianSequence]
@@ -76,14 +77,25 @@ class ClipWork:
         steps = (*parts, whole, *clips)
         return Plan(self.folder, steps, dict.fromkeys((step.stage for step in steps), self))
 
-    def write(self, sequence: GaussianSequence, path: Path, receipts: Mapping[str, Receipt]) -> list[Path]:
-        """Write an asset, or what is left of it to write when all steps are done; return its files, the root last."""
+    def write(self, sequence: GaussianSequence, path: Path, said: Mapping[str, Mapping[str, Any]]) -> list[Path]:
+        """Write an asset, or what is left of it to write when all steps are done; return its files, the root last.
+
+        Args:
+            sequence: What is written.
+            path: Root layer.
+            said: Facts of the steps, by name; those of other steps do not matter.
+        """
         from beam_warp.converters import usd
         from beam_warp.schema.writer import WrittenClips
 
-        known = receipts.get(self._whole)
-        clips = None if known is None else WrittenClips(_survey_of(known.facts["survey"]), self.folder / FOLDER)
+        known = said.get(self._whole)
+        clips = None if known is None else WrittenClips(_survey_of(known["survey"]), self.folder / FOLDER)
         return usd.write(sequence, path, self.options, clips)
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the files of the asset that was written, but for the clips, which are outputs of their own steps."""
+        clips = {path.name for path in (self.folder / FOLDER).glob(f"{self.stem}.*")}
+        return tuple(path for path in sorted(self.folder.glob(f"{self.stem}.*")) if path.name not in clips)
 
     @property
     def _survey(self) -> str:

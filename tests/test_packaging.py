@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import beam_warp
-from beam_warp.cli.reconstruct import STEP_MODULES
+from beam_warp.cli.main import STEP_MODULES
 
 ROOT = Path(__file__).parent.parent
 FOLDERS = {

@@ -12,6 +12,7 @@ from beam_warp.cli.common.console import options_named, run_command
 from beam_warp.cli.common.pages import parse
 from beam_warp.cli.common.paths import paths_checked
 from beam_warp.errors import InvalidOptionError
+from beam_warp.plan.workers import serve
 
 _HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, view, evaluate, demonstrate.
 
@@ -61,6 +62,9 @@ COMMANDS = {
     "plan": Command("ShowPlan", "Say how far a long job is: frames done, running, left, failed, and an estimate."),
 }
 
+STEP_MODULES = ("beam_warp.decomposition.work", "beam_warp.reconstruction.steps")
+"""What processes need for steps of reconstruction and materials."""
+
 MOVED = {("render", "--channel"): "beam channel ASSET NAME --out FILE"}
 """Options that became commands of their own."""
 
@@ -78,6 +82,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(lambda: _run(words[0], words[1:]))
 
 
+def _workers(words: Sequence[str]) -> str:
+    """Return who is to work, before options are read."""
+    for given, following in zip(words, [*words[1:], ""], strict=True):
+        name, _, value = given.partition("=")
+        if name == "--workers":
+            return value or following
+    return "1"
+
+
 def _run(word: str, words: list[str]) -> int:
     """Read the options of a command and run it."""
     if word not in COMMANDS:
@@ -85,6 +98,8 @@ def _run(word: str, words: list[str]) -> int:
     for (command, option), now in MOVED.items():
         if word == command and any(given.split("=")[0] == option for given in words):
             raise InvalidOptionError(f"{option[2:]} must be drawn by a command of its own. Use {now}.")
+    if word in ("run", "reconstruct") and _workers(words) != "1":
+        serve(STEP_MODULES)  # it imports while this process does
     record, function = COMMANDS[word].load(word)
     with options_named(record):
         options = parse(record, words, f"beam {word}")

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 
 USUAL_PRESET = "fast"
 
-STEP_MODULES = ("beam_warp.decomposition.work", "beam_warp.reconstruction.steps")
-"""What workers need for steps of reconstruction and materials."""
-
 PILOTS = 3
 """Settings that are tried where no error is asked."""
 
@@ -103,7 +100,7 @@ def reconstruct(args: Reconstruct) -> int:
     """Reconstruct and say what came out."""
     started = time.perf_counter()
     capture = Capture.read(args.capture)
-    crew = crew_of(args.workers, args.device, STEP_MODULES)
+    crew = crew_of(args.workers, args.device)
     options, target, chosen = options_of(args.modelling, capture), args.targets.target, None
     light = None if capture.environment_path is None else EnvironmentMap.read(capture.environment_path)
     asked = Asked(capture, args.seed, args.device, light)

@@ -28,16 +28,7 @@ from beam_warp.cli.decompose import (
     state_target,
     with_rays,
 )
-from beam_warp.cli.reconstruct import (
-    STEP_MODULES,
-    Asked,
-    Modelling,
-    modelling_for,
-    options_of,
-    steps_of,
-    summary,
-    with_modelling,
-)
+from beam_warp.cli.reconstruct import Asked, Modelling, modelling_for, options_of, steps_of, summary, with_modelling
 from beam_warp.converters.numbering import SOG_NAMES, holds_gaussians
 from beam_warp.errors import InvalidOptionError, MissingFileError
 from beam_warp.plan.crew import crew_of
@@ -99,7 +90,7 @@ def run(args: Run) -> int:
     _check_words(args, capture)
     written = converters.WriteOptions(keyed=args.keyed, error_scale=args.error_scale)
     light = light_of(args.measuring, capture, args.input)
-    crew = crew_of(args.workers, args.device, STEP_MODULES)
+    crew = crew_of(args.workers, args.device)
     environment = EnvironmentMap.read(light).rotated(args.measuring.rotate)
     if args.fps is not None:
         require_number("frames_per_second", args.fps, 1e-3, 1e6)

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from beam_warp.jobs.store import is_stored_frame, read_frame, write_frame
 from beam_warp.materials.base_color import BaseColor
 from beam_warp.materials.direct import ColorEvidence
+from beam_warp.materials.roughness import RoughnessProfile
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud
 
-_STORED = re.compile(r"(?:frame|solution)_(\d{6,})\.h5")
+_STORED = re.compile(r"(?:frame|solution|profile)_(\d{6,})\.h5")
 
 EVIDENCE = "evidence_"
 """Prefix of the stored arrays of evidence."""
@@ -112,6 +113,24 @@ class FrameArchive:
     def frame_path(self, number: int) -> Path:
         """Return the file of a frame's measurements."""
         return self.folder / f"frame_{number:06d}.h5"
+
+    def keep_profile(self, number: int, profile: RoughnessProfile | None) -> None:
+        """Store what views of a frame say of roughness; None where they say nothing.
+
+        Raises:
+            OutputError: The file cannot be written; nothing is left behind.
+        """
+        told = {} if profile is None else {"misfit": profile.misfit, "views": profile.views, "tilt": profile.tilt}
+        write_frame(self.profile_path(number), {name: np.asarray(array) for name, array in told.items()})
+
+    def profile(self, number: int) -> RoughnessProfile | None:
+        """Return what was kept of a frame's roughness."""
+        arrays = read_frame(self.profile_path(number))
+        return RoughnessProfile(arrays["misfit"], arrays["views"], tilt=arrays["tilt"]) if arrays else None
+
+    def profile_path(self, number: int) -> Path:
+        """Return the file of what views of a frame say of roughness."""
+        return self.folder / f"profile_{number:06d}.h5"
 
     def solution_path(self, number: int) -> Path:
         """Return the file of a frame's base colour."""

@@ -14,13 +14,13 @@ continues. What they find is kept in a folder (`beam_warp.decomposition.archive`
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from threading import Thread
+from threading import Timer
 from typing import Any
 
 from beam_warp.capture.capture import Capture
@@ -35,7 +35,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.jobs.report import REPORT_NAME, write_report
 from beam_warp.plan.carry import Counted, carry_out
-from beam_warp.plan.steps import Receipt
+from beam_warp.plan.steps import Plan, Receipt
 from beam_warp.plan.workers import Crew, in_process
 from beam_warp.reconstruction.job import Reconstruction, ReconstructionWork
 from beam_warp.world.environment import EnvironmentMap
@@ -43,8 +43,9 @@ from beam_warp.world.gaussians import GaussianSequence
 
 OVERVIEW_NAME = "overview.png"
 
-LATE = ("trimesh", "scipy.interpolate", "beam_warp.converters.usd")
-"""Modules that a take can start without, but that take long to import: of previews, of roughness, of the asset."""
+AHEAD_AFTER = 2.5
+"""Time after which modules for later are imported [s]: the first fit has begun by then, which waits for the device, and
+what is done before does not."""
 
 COUNTED = {"materials": "decompose"}
 """Stages that a listener hears of when a step is done, and what they are called."""
@@ -172,23 +173,30 @@ def run_capture(
     """
     with closing(frames):
         notes = _prepare(work)
-        _import_ahead()
         plan = work.plan().with_steps_of(frames.plan())
         watch = Counted(plan, {"frame": "frames", **COUNTED}, work.progress)
-        receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
-        found = frames.finish(receipts, started, work.progress)
+        with _importing_ahead(plan, work.device):
+            receipts = carry_out(plan, crew(plan, work.device_kind, work.progress), watch)
+        found = frames.finish(receipts, started)
         return TakeResult(found, _finish(work, receipts, notes, overview or OverviewOptions(), started))
 
 
-def _import_ahead() -> None:
-    """Import what later steps and the end need, while the first ones wait for the device."""
+@contextmanager
+def _importing_ahead(plan: Plan, device: Any) -> Iterator[None]:
+    """Import what later steps and the end need, and start the device, while steps wait for it or others do them."""
 
     def load() -> None:
         with suppress(ImportError):  # whoever needs it says so
-            for name in LATE:
+            for name in (name for work in plan.works.values() for name in work.later):
                 import_module(name)
+        _ = device.context
 
-    Thread(target=load).start()
+    timer = Timer(AHEAD_AFTER, load)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _prepare(work: MaterialWork) -> list[str]:
@@ -222,7 +230,8 @@ def _finish(
         with ThreadPoolExecutor(1) as beside:
             drawn = beside.submit(draw)
             with log.timer("write asset"):
-                layers = work.clips.write(relightable, staged / ASSET_NAME, receipts)
+                said = {name: receipt.facts for name, receipt in receipts.items()}
+                layers = work.clips.write(relightable, staged / ASSET_NAME, said)
             drawn.result()
         work.progress("overview", 1, 1)
         seconds = time.perf_counter() - started

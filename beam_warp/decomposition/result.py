@@ -16,7 +16,7 @@ from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.solve import SolvedFrames
 from beam_warp.decomposition.tally import summary as tally
 from beam_warp.decomposition.tally import warnings_about
-from beam_warp.decomposition.work import material_step, solution_step
+from beam_warp.decomposition.work import material_step, profile_step, solution_step
 from beam_warp.image.files import write_png
 from beam_warp.jobs.report import device_facts, versions
 from beam_warp.materials.pilot import summary
@@ -54,7 +54,7 @@ class Measurements:
     @classmethod
     def of(cls, receipts: Mapping[str, Receipt], numbers: Sequence[int]) -> Measurements:
         """Add up the receipts of all steps, given what the frames are called."""
-        names = ("light", "roughness", "joint", *map(solution_step, numbers))
+        names = ("light", *map(profile_step, numbers), "roughness", "joint", *map(solution_step, numbers))
         shared = [receipts[name] for name in names if name in receipts]
         frames = [receipts[material_step(number)] for number in numbers]
         steps = [(step, dict(step.facts)) for step in (*shared, *frames)]  # which reads them, once

@@ -1,13 +1,14 @@
-"""Roughness of the frames of a job: as it is stated, or estimated from what views of some frames show.
+"""Roughness of the frames of a job, estimated from what views of some frames show.
 
-Frames are asked as long as they change the answer by more than a part of its own stated error. Where a pilot, some
-Gaussians of the first frame, finds that views say nothing of roughness, none is asked.
+What each frame says is measured by itself, so that several workers may share the frames. Frames count as long as they
+change the answer by more than a part of its own stated error. Where a pilot, some Gaussians of the first frame, finds
+that views say nothing of roughness, no frame is measured.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -56,28 +57,24 @@ def asked_frames(count: int) -> list[int]:
     return order
 
 
-def find_roughness(plan: JobPlan, frames: Iterable[SeenFrame], count: int) -> RoughnessEstimate:
-    """Estimate the roughness of Gaussians from what the views of some frames show, which all have them.
+def find_roughness(
+    positions: NDArray[np.float32], profiles: Iterable[RoughnessProfile], count: int
+) -> RoughnessEstimate:
+    """Estimate the roughness of Gaussians from what the views of some frames say, which all have them.
 
     The report also has ``frames_left_out``, and by how much these would have changed roughness, root mean square,
     as far as the frames before them tell (``left_out_change``).
 
     Args:
-        plan: The job.
-        frames: Read one at a time, as long as they are needed.
-        count: How many there are.
+        positions: Of the Gaussians in the first of these frames [m], ``(N, 3)``.
+        profiles: Of the frames, taken one at a time, as long as they are needed; none where views say nothing.
+        count: How many frames there are.
     """
-    positions, asked = np.zeros((0, 3), np.float32), np.zeros(0, np.intp)
+    asked = evenly_spread(positions, TOLD_GAUSSIANS)
     total: RoughnessProfile | None = None
     told: RoughnessEstimate | None = None
     used, change = 0, 0.0
-    for seen in frames:
-        if total is None:
-            positions = seen.cloud.positions
-            asked = evenly_spread(positions, TOLD_GAUSSIANS)
-            if _are_silent(plan, seen, count):
-                break
-        profile = _measured(plan, seen)
+    for profile in profiles:
         total, used = profile if total is None else total + profile, used + 1
         if used == count:
             change = 0.0
@@ -93,7 +90,21 @@ def find_roughness(plan: JobPlan, frames: Iterable[SeenFrame], count: int) -> Ro
     return replace(estimate, report={**estimate.report, **left_out})
 
 
-def _measured(plan: JobPlan, seen: SeenFrame, rows: NDArray[np.intp] | None = None) -> RoughnessProfile:
+def profiles_of(plan: JobPlan, frames: Iterable[SeenFrame], count: int) -> Iterator[RoughnessProfile]:
+    """Yield what views of each frame say of its Gaussians; nothing where a pilot finds that they say nothing.
+
+    Args:
+        plan: The job.
+        frames: Read one at a time.
+        count: How many there are.
+    """
+    for place, seen in enumerate(frames):
+        if place == 0 and are_silent(plan, seen, count):
+            return
+        yield measured_profile(plan, seen)
+
+
+def measured_profile(plan: JobPlan, seen: SeenFrame, rows: NDArray[np.intp] | None = None) -> RoughnessProfile:
     """Return what views of a frame say of all of its Gaussians, or of some."""
     scene, points, views = seen.scene, seen.points, seen.views
     with seen.log.timer("roughness"):
@@ -110,12 +121,12 @@ def _measured(plan: JobPlan, seen: SeenFrame, rows: NDArray[np.intp] | None = No
         )
 
 
-def _are_silent(plan: JobPlan, seen: SeenFrame, count: int) -> bool:
-    """Return whether views say so little of some Gaussians that all of them, in all frames, would claim nothing."""
+def are_silent(plan: JobPlan, seen: SeenFrame, count: int) -> bool:
+    """Return whether views say so little of some Gaussians that all of them, in so many frames, would claim nothing."""
     gaussians, asked = len(seen.cloud), evenly_spread(seen.cloud.positions, PILOT_GAUSSIANS)
     if gaussians < LEAST_SAVED * len(asked):
         return False
-    report = solve_roughness(seen.cloud.positions[asked], _measured(plan, seen, asked)).report
+    report = solve_roughness(seen.cloud.positions[asked], measured_profile(plan, seen, asked)).report
     agreement = max(report[scale]["agreement"] for scale in ("near", "wide"))
     return agreement * count * gaussians / len(asked) <= LEAST_AGREEMENT
 

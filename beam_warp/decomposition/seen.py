@@ -59,12 +59,7 @@ class SeenFrame:
         if self.capture is None:
             return []
         with self.log.timer("read images"):
-            return self.__dict__.pop("read", None) or self.capture.views(self.number)
-
-    def read_ahead(self) -> None:
-        """Read the images for whoever asks next, in a thread that touches no device."""
-        if self.capture is not None and "views" not in self.__dict__:
-            self.__dict__["read"] = self.capture.views(self.number)
+            return self.capture.views(self.number)
 
     @cached_property
     def views(self) -> ViewEvidence | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
@@ -26,7 +26,13 @@ from beam_warp.decomposition.frames import Frames
 from beam_warp.decomposition.measure import FrameMeasurement
 from beam_warp.decomposition.options import ESTIMATE, RunOptions
 from beam_warp.decomposition.plan import JobPlan
-from beam_warp.decomposition.roughness_finder import asked_frames, find_roughness
+from beam_warp.decomposition.roughness_finder import (
+    are_silent,
+    asked_frames,
+    find_roughness,
+    measured_profile,
+    profiles_of,
+)
 from beam_warp.decomposition.seen import SeenFrame
 from beam_warp.decomposition.solve import AT_A_TIME, JointColor, SolvedFrames, solve_frame, solve_jointly
 from beam_warp.decomposition.source import Source
@@ -36,7 +42,7 @@ from beam_warp.digests import array_digest, code_digest
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.listeners import NotedProgress, no_progress
 from beam_warp.jobs.progress import JobLog
-from beam_warp.jobs.store import make_folders, read_frame, write_frame
+from beam_warp.jobs.store import frame_names, make_folders, read_frame, write_frame
 from beam_warp.materials.direct import ColorEvidence
 from beam_warp.materials.roughness import RoughnessEstimate
 from beam_warp.materials.roughness_source import RoughnessTexture, stated_roughness
@@ -48,7 +54,7 @@ from beam_warp.world.gaussians import ATTRIBUTES, GaussianSequence
 
 ASSET_STEM = Path(ASSET_NAME).stem
 
-STAGES = ("light", "roughness", "materials", "joint", "solution")
+STAGES = ("light", "profile", "roughness", "materials", "joint", "solution")
 
 PART = 30
 """Frames of persistent Gaussians whose solutions a step writes: they take a moment each."""
@@ -67,6 +73,7 @@ class MaterialWork:
         written: How the asset is written.
     """
 
+    later = ("scipy.interpolate",)  # of roughness
     folder: Path
     frames: Frames
     environment: EnvironmentMap
@@ -104,8 +111,13 @@ class MaterialWork:
         numbers = self.frames.numbers()
         made = [self.frames.step(number) for number in numbers]
         steps, shared = [Step("light", "light", None, made[0], Rank.SHARED)], ("light",)
-        if self.options.roughness == ESTIMATE and self._may_be_persistent:
-            inputs = ("light", *(name for names in made for name in names))
+        if self._shares_roughness:
+            first: tuple[str, ...] = ()
+            for index in self._asked:
+                inputs = ("light", *made[index], *first)
+                steps.append(Step(profile_step(numbers[index]), "profile", numbers[index], inputs, Rank.SHARED))
+                first = first or (profile_step(numbers[index]),)  # whose pilot says whether the others are asked
+            inputs = (*(profile_step(numbers[index]) for index in self._asked), *(it for names in made for it in names))
             steps.append(Step("roughness", "roughness", None, inputs, Rank.SHARED))
             shared = (*shared, "roughness")
         for index, number in enumerate(numbers):
@@ -174,6 +186,16 @@ class MaterialWork:
     def _solves_later(self) -> bool:
         """Whether base colour is solved when all frames are measured, over all of them if they are persistent."""
         return self.options.images is None and self._may_be_persistent
+
+    @property
+    def _shares_roughness(self) -> bool:
+        """Whether one roughness is estimated of Gaussians that persist."""
+        return self.options.roughness == ESTIMATE and self._may_be_persistent
+
+    @property
+    def _asked(self) -> list[int]:
+        """Places of the frames that the roughness of Gaussians that persist is found from."""
+        return asked_frames(len(self.frames.numbers()))
 
     @property
     def _may_be_persistent(self) -> bool:
@@ -260,10 +282,10 @@ class MaterialWork:
         if step.stage == "light":
             text = self._frame_digest(0) + str(self.source.is_display_referred())
             return array_digest(self.environment.radiance, text=f"{text} {self.source.has_light}")
-        if step.stage in ("joint", "solution"):
+        if step.stage in ("roughness", "joint", "solution"):
             return ""
-        if step.stage == "roughness":
-            return " ".join(map(self._frame_digest, asked_frames(len(self.source.sequence))))
+        if step.stage == "profile":
+            return self._frame_digest(self._place(step))
         return f"{self.solves} {self._frame_digest(self._place(step))}"
 
     def _frame_digest(self, index: int) -> str:
@@ -287,9 +309,8 @@ class MaterialWork:
     @cached_property
     def _most_kept(self) -> int:
         """How many frames are kept with what their views show: all, if roughness is found from all; else the latest."""
-        asked = asked_frames(len(self.frames.numbers()))
-        is_asked = self.options.roughness == ESTIMATE and self._may_be_persistent
-        return len(asked) if is_asked and len(asked) == len(self.frames.numbers()) else 1
+        count = len(self.frames.numbers())
+        return count if self._shares_roughness and len(self._asked) == count else 1
 
     def _place(self, step: Step) -> int:
         assert step.frame is not None
@@ -307,16 +328,20 @@ class MaterialWork:
         index = self._place(step)
         if step.stage == "solution":
             return tuple(map(self.archive.solution_path, self._solved_by(index)))
+        if step.stage == "profile":
+            return (self.archive.profile_path(index),)
         return (self.archive.frame_path(index), *([self.archive.solution_path(index)] if self.solves else []))
 
     def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
-        """Find the light or the roughness, or measure a frame."""
+        """Find the light, roughness or base colour of all frames, or measure one."""
         seconds = self.source.log.timer.seconds
         seconds.clear()
         if task.step.stage == "light":
             facts = self._find_light()
         elif task.step.stage == "roughness":
             facts = self._find_roughness()
+        elif task.step.stage == "profile":
+            facts = self._measure_profile(self._place(task.step))
         elif task.step.stage == "joint":
             facts = self._solve_jointly()
         elif task.step.stage == "solution":
@@ -337,25 +362,20 @@ class MaterialWork:
         if not self.are_persistent:
             write_frame(self.stored("roughness"), {})
             return {}
-        asked = asked_frames(len(self.source.sequence))
-        estimate = find_roughness(self.job, self._frames(asked), len(asked))
+        profiles = filter(None, map(self.archive.profile, self._asked))
+        estimate = find_roughness(self.source.first.cloud.positions, profiles, len(self._asked))
         write_frame(self.stored("roughness"), _roughness_arrays(estimate))
         return {"roughness": estimate.report}
 
-    def _frames(self, indices: Sequence[int]) -> Iterator[SeenFrame]:
-        """Yield frames; while one is worked on, the next one and its images are read."""
-
-        def read(index: int) -> SeenFrame:
-            frame = self._frame(index)
-            frame.read_ahead()
-            return frame
-
-        with ThreadPoolExecutor(1) as reader:
-            ahead = reader.submit(read, indices[0])
-            for index in indices[1:]:
-                frame, ahead = ahead.result(), reader.submit(read, index)
-                yield frame
-            yield ahead.result()
+    def _measure_profile(self, index: int) -> dict[str, Any]:
+        """Measure what views of a frame say of roughness; nothing where a pilot in the first one finds that none do."""
+        frame, first = self._frame(index), self._asked[0]
+        if index == first:
+            is_silent = are_silent(self.job, frame, len(self._asked))
+        else:
+            is_silent = not frame_names(self.archive.profile_path(first))
+        self.archive.keep_profile(index, None if is_silent else measured_profile(self.job, frame))
+        return {}
 
     def _measure(self, index: int) -> dict[str, Any]:
         """Measure a frame and store it."""
@@ -408,7 +428,7 @@ class MaterialWork:
         shared = read_frame(self.stored("roughness")) if self._may_be_persistent else {}
         if shared:
             return shared
-        estimate = find_roughness(self.job, [frame], 1)
+        estimate = find_roughness(frame.cloud.positions, profiles_of(self.job, [frame], 1), 1)
         facts["roughness"] = estimate.report
         return _roughness_arrays(estimate)
 
@@ -416,6 +436,11 @@ class MaterialWork:
 def material_step(number: int) -> str:
     """Return the name of the step that measures a frame."""
     return f"materials-{number:06d}"
+
+
+def profile_step(number: int) -> str:
+    """Return the name of the step that measures what views of a frame say of roughness."""
+    return f"profile-{number:06d}"
 
 
 def solution_step(number: int) -> str:

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,7 @@ class _Job:
     receipts: dict[str, Receipt] = field(default_factory=dict)
     running: dict[str, _Running] = field(default_factory=dict)
     following: dict[str, tuple[Step, ...]] = field(default_factory=dict)
+    stages: dict[str, set[str]] = field(default_factory=dict)
     hung: set[str] = field(default_factory=set)
     errors: dict[str, list[str]] = field(default_factory=dict)
     raised: dict[str, Exception] = field(default_factory=dict)
@@ -167,10 +169,12 @@ def _as_record(plan: Plan) -> dict[str, Any]:
 
 def _hand_out(job: _Job) -> None:
     """Give steps to idle workers."""
-    for worker in job.workers.idle():
-        step = job.schedule.next(job.following.get(worker, ()))
-        if step is None:
-            return
+    job.schedule.workers, idle = job.workers.count, job.workers.idle()  # in a cluster, the count changes
+    while idle and (first := job.schedule.first()) is not None:
+        worker = max(idle, key=partial(_is_ready_for, job, first))
+        idle.remove(worker)
+        step = job.schedule.take(first, job.following.get(worker, ()))
+        job.stages.setdefault(worker, set()).add(step.stage)
         following = job.following[worker] = job.schedule.likely_after(step)
         inputs = [(_folder(job, name), job.receipts[name]) for name in step.inputs]
         awaited = tuple(entry for folder, receipt in inputs for entry in awaited_files(folder, receipt))
@@ -178,6 +182,11 @@ def _hand_out(job: _Job) -> None:
         task = Task(step, keys, awaited, following, facts)
         job.running[step.name] = _Running(worker, job.workers.now())
         job.workers.start(worker, task)
+
+
+def _is_ready_for(job: _Job, step: Step, worker: str) -> tuple[bool, bool]:
+    """Return whether a worker has loaded what steps of a stage need, and whether it has read ahead for this one."""
+    return step.stage in job.stages.get(worker, ()), step in job.following.get(worker, ())
 
 
 def _take(job: _Job, outcome: Outcome, watch: Watch) -> None:

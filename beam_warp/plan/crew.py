@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.plan.steps import Plan
-from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process, serve
+from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process
 
 MOST_PROCESSES = 256
 """Processes of one machine, at most."""
@@ -15,7 +14,7 @@ MOST_PROCESSES = 256
 GPUS, RAY = "gpus", "ray"
 
 
-def crew_of(words: str, device: str | None, ahead: Sequence[str] = ()) -> Crew:
+def crew_of(words: str, device: str | None) -> Crew:
     """Return who does the work.
 
     Args:
@@ -23,7 +22,6 @@ def crew_of(words: str, device: str | None, ahead: Sequence[str] = ()) -> Crew:
             ``ray://HOST:PORT`` for one that is reached as a Ray client. With a number before, ``3@gpus`` or ``3@ray``,
             so many share each GPU.
         device: The device that steps are told to use; None lets every worker have its own.
-        ahead: Modules that processes of this machine will need; they are imported while the caller goes on.
 
     Raises:
         InvalidOptionError: They mean nothing, or contradict the device.
@@ -38,7 +36,6 @@ def crew_of(words: str, device: str | None, ahead: Sequence[str] = ()) -> Crew:
     if each and place == GPUS:
         if device is not None:
             raise InvalidOptionError(f"device must be left out with workers gpus, got {device}. Drop one of them.")
-        serve(ahead)
         return lambda plan, kind, progress: _processes(plan, kind, each * len(visible_gpus()), device)
     if not (words.isdecimal() and 1 <= int(words) <= MOST_PROCESSES):
         raise InvalidOptionError(
@@ -47,7 +44,6 @@ def crew_of(words: str, device: str | None, ahead: Sequence[str] = ()) -> Crew:
         )
     if int(words) == 1:
         return in_process
-    serve(ahead)
     return lambda plan, kind, progress: _processes(plan, kind, int(words), device)
 
 

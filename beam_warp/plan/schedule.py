@@ -1,5 +1,8 @@
 """Which step is next: steps whose inputs are done, those that finish frames before those that start them.
 
+Frames of a segment follow each other. So with more workers than segments in work, the next frame of a segment comes
+first, and the other workers finish what it leaves.
+
 A step that fails is tried once more, and is then given up: what needs it is left undone, and the rest goes on. A step
 whose worker ended is no failure at first, for machines and processes are killed for reasons of their own. A step whose
 output was found damaged is done again, and what needs it waits.
@@ -8,11 +11,12 @@ output was found damaged is done again, and what needs it waits.
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterable
 from enum import Enum
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.plan.steps import Step
+from beam_warp.plan.steps import Rank, Step
 
 FAILURES = 2
 """A step that failed so often is given up."""
@@ -38,6 +42,12 @@ class State(Enum):
     LEFT = "left out"
 
 
+IN_WORK = (State.READY, State.RUNNING)
+
+CHAINED: dict[int, tuple[State, ...]] = {Rank.KEY_FRAME: (State.RUNNING,), Rank.TRACKED_FRAME: IN_WORK}
+"""States in which a frame stands for its segment, which is in work."""
+
+
 class Schedule:
     """The state of every step of a plan.
 
@@ -45,15 +55,16 @@ class Schedule:
         steps: By name.
         states: By name.
         counts: How many steps are in each state.
+        workers: How many work at a time.
     """
 
-    def __init__(self, steps: Iterable[Step]) -> None:
-        """Start with nothing done.
+    def __init__(self, steps: Iterable[Step], workers: int = 1) -> None:
+        """Start with nothing done, for so many workers.
 
         Raises:
             InvalidOptionError: A step's name is not its own, or an input is none of the steps.
         """
-        given = tuple(steps)
+        given, self.workers = tuple(steps), workers
         self.steps = {step.name: step for step in given}
         absent = [name for step in given for name in step.inputs if name not in self.steps]
         if absent or len(self.steps) < len(given):
@@ -63,13 +74,12 @@ class Schedule:
             )
         self.states = dict.fromkeys(self.steps, State.WAITING)
         self.counts = {state: len(given) if state is State.WAITING else 0 for state in State}
-        self._order = {
-            step.name: (-step.rank, -1 if step.frame is None else step.frame, place) for place, step in enumerate(given)
-        }
+        self._order = {step.name: (-1 if step.frame is None else step.frame, place) for place, step in enumerate(given)}
         self._dependents: dict[str, list[str]] = {name: [] for name in self.steps}
         self._open = {step.name: len(set(step.inputs)) for step in given}
         self._tries: dict[tuple[str, str], int] = {}
-        self._ready: list[tuple[tuple[int, int, int], str]] = []
+        self._ready: dict[int, list[tuple[tuple[int, int], str]]] = {}
+        self._segments = 0
         for step in given:
             for name in set(step.inputs):
                 self._dependents[name].append(step.name)
@@ -80,29 +90,44 @@ class Schedule:
     @property
     def is_over(self) -> bool:
         """Whether nothing can be done any more."""
-        return not any(self.counts[state] for state in (State.READY, State.RUNNING))
+        return not any(self.counts[state] for state in IN_WORK)
 
-    def next(self, preferred: Iterable[Step] = ()) -> Step | None:
-        """Take the step to be done next; None where all that is left waits for others.
+    def next(self) -> Step | None:
+        """Take the step to be done next; None where all that is left waits for others."""
+        first = self.first()
+        return None if first is None else self.take(first)
+
+    def take(self, first: Step, preferred: Iterable[Step] = ()) -> Step:
+        """Take the most urgent step, or another one that is as urgent.
 
         Args:
-            preferred: Steps that the worker has read ahead for: taken first, unless others have a higher rank.
+            first: What `first` returns.
+            preferred: Steps that the worker has read ahead for.
         """
-        while self._ready and self.states[self._ready[0][1]] is not State.READY:
-            heapq.heappop(self._ready)
-        if not self._ready:
-            return None
-        first = self.steps[self._ready[0][1]]
-        ahead = (step for step in preferred if self.states[step.name] is State.READY and step.rank >= first.rank)
+        ahead = (step for step in preferred if self.states[step.name] is State.READY and step.rank == first.rank)
         step = next(ahead, first)
         self._set(step.name, State.RUNNING)
         return step
 
     def likely_after(self, step: Step) -> tuple[Step, ...]:
         """Return the steps that are likely to follow a running one: what waits for it alone, and one of the others."""
-        freed = [name for name in self._dependents[step.name] if self._open[name] == 1]
-        queued = [name for _, name in self._ready[:1] if self.states[name] is State.READY]
-        return tuple(self.steps[name] for name in sorted(freed + queued, key=self._order.__getitem__)[:LIKELY])
+        freed = [self.steps[name] for name in self._dependents[step.name] if self._open[name] == 1]
+        other = self.first()
+        found = freed if other is None else [*freed, other]
+        return tuple(sorted(found, key=lambda it: (-self._urgency(it), self._order[it.name]))[:LIKELY])
+
+    def first(self) -> Step | None:
+        """Return the most urgent step that is ready; None where there is none."""
+        firsts = []
+        for heap in self._ready.values():
+            while heap and self.states[heap[0][1]] is not State.READY:
+                heapq.heappop(heap)
+            firsts += [self.steps[name] for _, name in heap[:1]]
+        return max(firsts, key=lambda step: self._urgency(step), default=None)
+
+    def _urgency(self, step: Step) -> float:
+        """Return what steps are taken by, the highest first: their rank, but for chains that may not wait."""
+        return math.inf if step.rank == Rank.TRACKED_FRAME and self._segments < self.workers else step.rank
 
     def done(self, name: str) -> None:
         """Note that a step is done."""
@@ -158,9 +183,12 @@ class Schedule:
 
     def _enqueue(self, name: str) -> None:
         self._set(name, State.READY)
-        heapq.heappush(self._ready, (self._order[name], name))
+        heapq.heappush(self._ready.setdefault(self.steps[name].rank, []), (self._order[name], name))
 
     def _set(self, name: str, state: State) -> None:
-        self.counts[self.states[name]] -= 1
+        before = self.states[name]
+        self.counts[before] -= 1
         self.counts[state] += 1
+        counted = CHAINED.get(self.steps[name].rank, ())
+        self._segments += (state in counted) - (before in counted)
         self.states[name] = state

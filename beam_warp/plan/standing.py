@@ -165,7 +165,7 @@ def simulated(steps: Iterable[Step], done: Iterable[str], seconds: Mapping[str, 
         seconds: How long a step takes, by its stage [s].
         workers: How many work at a time.
     """
-    schedule, kept = Schedule(steps), set(done)
+    schedule, kept = Schedule(steps, workers), set(done)
     now, running = 0.0, list[tuple[float, str]]()
     while not schedule.is_over:
         while len(running) < workers and (step := schedule.next()) is not None:

@@ -69,6 +69,11 @@ class Work(Protocol):
 
     folder: Path
 
+    @property
+    def later(self) -> tuple[str, ...]:
+        """Modules that some steps need, and that take long to import: whoever has time does that ahead."""
+        ...
+
     def common(self) -> str:
         """Return all that every step depends on: the code, the kind of device, the options."""
         ...

@@ -8,6 +8,7 @@ once. The server never starts CUDA, which does not survive a fork.
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import pickle
@@ -19,6 +20,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing import connection, forkserver
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,6 +39,9 @@ CAN_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 
 UNKNOWN_END = 255
 """Exit code of a process that has outlived its server: nobody knows how it ended."""
+
+IDLE = 0.25
+"""Time without a task after which a process imports what it may need later [s]."""
 
 MOST_STARTS = 10
 """Times that a process is started anew because its server was killed meanwhile."""
@@ -378,8 +383,17 @@ def _serve(link: Any, setting: Mapping[str, str]) -> None:
         link.send(error)
         return
     link.send(None)
+    gc.freeze()  # what the server has imported is never garbage, and need not be looked at again and again
+    gc.set_threshold(5_000)  # as in a command's own process
+    later = [name for work in works.values() for name in work.later]
     while True:
-        link.send(attempt(works, tasks.get()))
+        try:
+            task = tasks.get(timeout=IDLE if later else None)
+        except queue.Empty:
+            with suppress(ImportError):  # the step that needs it says so
+                import_module(later.pop())
+        else:
+            link.send(attempt(works, task))
 
 
 def _listen(link: Any, tasks: queue.SimpleQueue[Any]) -> None:

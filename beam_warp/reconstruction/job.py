@@ -67,6 +67,7 @@ from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
 
 ASSET_NAME = "gaussians.usda"
+ASSET_STEM = Path(ASSET_NAME).stem
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,12 +179,12 @@ def reconstruct(
     plan = work.plan()
     with closing(work):
         receipts = carry_out(plan, crew(plan, work.device_kind, progress), Counted(plan, {"frame": "frames"}, progress))
-        return work.finish(receipts, started, progress)
+        return work.finish(receipts, started)
 
 
 @dataclass(eq=False)
 class ReconstructionWork:
-    """Steps that find the Gaussians of every frame: those of `MENDS`, ``frame``, ``seam`` and ``preview``.
+    """Steps that find the Gaussians of every frame: those of `MENDS`, ``frame``, ``seam``, ``preview``, and the asset.
 
     Attributes:
         capture: Images and cameras.
@@ -194,6 +195,7 @@ class ReconstructionWork:
         notes: What a killed call had left half written, and was removed.
     """
 
+    later = ("trimesh", "beam_warp.converters.usd")  # of previews, of the asset
     capture: Capture
     folder: Path
     steps: FrameSteps
@@ -238,8 +240,14 @@ class ReconstructionWork:
                     goes_on = frame_step(self._before(frame)) if previous is None else seam_step(previous)
                     steps.append(Step(seam_step(frame), "seam", frame, (goes_on,), Rank.TRACKED_FRAME))
                 steps.append(Step(f"preview-{frame:06d}", "preview", frame, self.makers(frame), Rank.PREVIEW))
+        clips = self.clips.plan()
+        inputs = (
+            *(name for frame in self.frames.records for name in self.makers(frame)),
+            *(it.name for it in clips.steps),
+        )
+        steps.append(Step(ASSET_STEM, ASSET_STEM, None, inputs, Rank.KEY_FRAME))
         own = Plan(self.folder, tuple(steps), dict.fromkeys((step.stage for step in steps), self))
-        return own.with_steps_of(self.clips.plan())
+        return own.with_steps_of(clips)
 
     @property
     def may_be_constant(self) -> bool:
@@ -251,7 +259,7 @@ class ReconstructionWork:
         """Steps that write the asset; of one segment alone, the topology is known when all frames are made."""
         numbers, read = tuple(self.frames.records), partial(self.sequence, is_constant=False)
         makers, shared = list(map(self.makers, numbers)), frozenset({"ids"}) if self.may_be_constant else None
-        return ClipWork(self.folder, Path(ASSET_NAME).stem, read, makers, numbers, shared)
+        return ClipWork(self.folder, ASSET_STEM, read, makers, numbers, shared)
 
     def makers(self, frame: int) -> tuple[str, ...]:
         """Return the names of the steps that make the Gaussians of a frame."""
@@ -312,6 +320,8 @@ class ReconstructionWork:
 
     def digest(self, step: Step) -> str:
         """Return the digest of a frame's records and images, and of its share; a preview has those of its frame."""
+        if step.stage == ASSET_STEM:
+            return f"{self.clips.common()} {self.sequence(is_constant=False).metadata}"
         if step.frame is None:
             with FrameReader(self.frames.records, self.store.digests) as reader:
                 return reader.digest(next(iter(self.frames.records)))
@@ -321,6 +331,8 @@ class ReconstructionWork:
 
     def outputs(self, step: Step) -> tuple[Path, ...]:
         """Return the file of a step; there is none where nothing was found wrong."""
+        if step.stage == ASSET_STEM:
+            return self.clips.files()
         if step.frame is None:
             return tuple(
                 path for mend in MENDS if mend.stage == step.stage and (path := self.folder / mend.kind.FILE).is_file()
@@ -329,8 +341,12 @@ class ReconstructionWork:
         return (kinds[step.stage](step.frame),)
 
     def do(self, task: Task, progress: NotedProgress) -> Mapping[str, Any]:
-        """Find what is wrong with the capture, model a frame, or draw its preview."""
+        """Find what is wrong with the capture, model a frame, draw its preview, or write the asset."""
         step = task.step
+        if step.stage == ASSET_STEM:
+            said = dict(zip(step.inputs, task.facts, strict=True))
+            self.clips.write(self.sequence(), self.folder / ASSET_NAME, said)
+            return {}
         if step.frame is None:
             return self._mend(step.stage, progress)
         if step.stage == "preview":
@@ -434,15 +450,11 @@ class ReconstructionWork:
         """Return the capture with the cameras that the Gaussians are fitted with."""
         return reduce(lambda capture, found: found.capture(capture), self.found.values(), self.capture)
 
-    def finish(self, receipts: Mapping[str, Receipt], started: float, progress: NotedProgress) -> Reconstruction:
-        """Write asset and report of a plan that was carried out, begun at a time [s]."""
-        progress("write asset", 0, 1)
-        sequence = self.sequence()
-        self.clips.write(sequence, self.folder / ASSET_NAME, receipts)
-        progress("write asset", 1, 1)
+    def finish(self, receipts: Mapping[str, Receipt], started: float) -> Reconstruction:
+        """Write the report of a plan that was carried out, begun at a time [s]."""
         report = {**self._report(receipts), "seconds": time.perf_counter() - started}
         write_report(self.folder, report)
-        return Reconstruction(self.folder / ASSET_NAME, sequence, report, self.seen())
+        return Reconstruction(self.folder / ASSET_NAME, self.sequence(), report, self.seen())
 
     def _frame_report(self, frame: int, receipts: Mapping[str, Receipt]) -> dict[str, Any]:
         """Return what a frame's report says; Gaussians and seconds are those of both segments where one fades out."""

@@ -21,7 +21,7 @@ from beam_warp.errors import InvalidOptionError
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, RasterOptions
 from beam_warp.reconstruction.fit import mean_psnr
-from beam_warp.reconstruction.joints.graph import JointGraph
+from beam_warp.reconstruction.joints.graph import JointGraph, stable_order
 from beam_warp.reconstruction.joints.rigidity import RigidityLoss
 from beam_warp.reconstruction.joints.skinning import BLENDS, Anchors, Skin
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, ViewTargets, shuffled_views
@@ -302,7 +302,7 @@ def hanging_together(cloud: GaussianCloud, anchors: Anchors, size: int, device: 
     count, joint = len(cloud), anchors.joints[:, 0]
     places = upload(cloud.positions, wp.vec3, device)
     order = morton_order(places, places, wp.ones(count, dtype=int, device=device))[0].numpy()[:count]
-    order = order[np.argsort(joint[order], kind="stable")]
+    order = order[stable_order(joint[order], int(joint.max(initial=0)) + 1)]
     within = np.arange(count) - np.searchsorted(joint[order], joint[order])
     labels = np.empty(count, np.int64)
     labels[order] = np.cumsum(within % size == 0) - 1

@@ -71,7 +71,7 @@ class TestReconstruct:
         assert beam("plan", tmp_path / "2", "--html", tmp_path / "page.html") == 0
         said = capsys.readouterr().out
         assert re.search(r"frame +4/4 +0 +0", said)
-        assert "all 13 steps are done" in said
+        assert "all 14 steps are done" in said
         page = (tmp_path / "page.html").read_text()
         assert page.count("<img") == page.count('src="2/previews/') == 4
 

@@ -26,6 +26,7 @@ COUNT = MAX_FRAMES_IN_ONE_LAYER + CLIP_FRAMES // 2
 class Made:
     """Steps that make frames: of each, only that it was made."""
 
+    later = ()
     folder: Path
     kind: str
 
@@ -82,7 +83,7 @@ def written(folder, kind, options=PLAIN):
     steps = [Step(f"frame-{number}", "frame", number) for number in range(COUNT)]
     plan = Plan(folder, tuple(steps), {"frame": made}).with_steps_of(clips.plan())
     receipts = carry_out(plan, here(plan))
-    clips.write(made.whole(), folder / "asset.usda", receipts)
+    clips.write(made.whole(), folder / "asset.usda", {name: receipt.facts for name, receipt in receipts.items()})
     return made, receipts, plan
 
 

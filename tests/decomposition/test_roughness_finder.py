@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beam_warp.decomposition import roughness_finder
-from beam_warp.decomposition.roughness_finder import PART, ROUGHNESS_FRAMES, asked_frames, find_roughness
+from beam_warp.decomposition.roughness_finder import PART, ROUGHNESS_FRAMES, asked_frames, find_roughness, profiles_of
 from beam_warp.materials.roughness import CANDIDATES, RoughnessProfile, evenly_spread, solve_roughness
 
 COUNT = 2000
@@ -58,7 +58,7 @@ def found(monkeypatch):
             for number in range(len(profiles))
         )
         read.clear()
-        return find_roughness(PLAN, frames, len(profiles)), read
+        return find_roughness(POSITIONS, profiles_of(PLAN, frames, len(profiles)), len(profiles)), read
 
     return find
 

@@ -61,6 +61,21 @@ def test_processes_write_the_same_bytes(ball, tmp_path, length, topology):
     assert look(tmp_path / "two").stages["materials"].done == 4
 
 
+def test_processes_share_roughness(ball, tmp_path):
+    """While one tracks, the other one measures what frames say of roughness; a step adds all up, to the same bytes."""
+    options = RunOptions(materials=MaterialOptions(sample_count=8), roughness="estimate", device="cpu")
+    one = take(ball, tmp_path / "one", FakeSteps(), 0, options=options)
+    two = take(ball, tmp_path / "two", FakeSteps(seconds=3.0), 0, crew_of("2", "cpu"), options)
+    assert results(tmp_path / "one") == results(tmp_path / "two")
+    assert one.result.report["roughness"] == two.result.report["roughness"]
+    receipts = look(tmp_path / "two").receipts
+    tracking, measuring = ({receipts[f"{it}-{frame:06d}"].worker for frame in (3, 4)} for it in ("frame", "profile"))
+    assert tracking.isdisjoint(measuring)
+    assert receipts["profile-000003"].ended < receipts["frame-000005"].ended
+    assert look(tmp_path / "two").stages["profile"].total == 4
+    assert look(tmp_path / "two").stages["roughness"].total == 1
+
+
 def test_frames_that_roughness_is_found_from_are_looked_at_once(ball, tmp_path, monkeypatch):
     """All frames of so short a take are: what their views show is kept until they are measured."""
     looked = []

@@ -74,6 +74,24 @@ class TestOrder:
             *("frame-2", "materials-2", "frame-3", "materials-3"),
         ]
 
+    def test_a_segment_goes_on_first_where_another_worker_can_finish_its_frames(self, tmp_path):
+        schedule, begun = Schedule(toy_plan(tmp_path, 6, 6).steps, workers=2), []
+        while (step := schedule.next()) is not None:
+            if 1 <= len(begun) <= 5:
+                assert schedule.likely_after(step)[0].name == f"frame-{len(begun)}"
+            begun.append(step.name)
+            schedule.done(step.name)
+        assert begun[:7] == ["cameras", *(f"frame-{frame}" for frame in range(6))]
+        assert begun[7:] == ["light", *(f"materials-{frame}" for frame in range(6))]
+
+    def test_frames_are_finished_first_where_every_worker_has_a_segment(self, tmp_path):
+        schedule = Schedule(toy_plan(tmp_path, 4, 2).steps, workers=2)
+        assert schedule.next().name == "cameras"
+        schedule.done("cameras")
+        assert [schedule.next().name for _ in range(2)] == ["frame-0", "frame-2"]
+        schedule.done("frame-0")
+        assert schedule.next().name == "light"
+
     def test_what_is_likely_next_is_next(self, tmp_path):
         schedule, guessed = Schedule(toy_plan(tmp_path, 6, 3).steps), []
         while (step := schedule.next()) is not None:
@@ -85,8 +103,8 @@ class TestOrder:
     def test_a_worker_goes_on_with_what_it_has_read_unless_frames_can_be_finished(self):
         schedule = Schedule([Step("a", "s", 0, (), 1), Step("b", "s", 1, (), 1), Step("c", "s", 2, (), 2)])
         ahead = (schedule.steps["b"],)
-        assert [schedule.next(ahead).name for _ in range(3)] == ["c", "b", "a"]
-        assert schedule.next(ahead) is None
+        assert [schedule.take(schedule.first(), ahead).name for _ in range(3)] == ["c", "b", "a"]
+        assert schedule.first() is None
 
     @pytest.mark.parametrize("steps", [[Step("a", "s"), Step("a", "s")], [Step("a", "s", None, ("b",))]])
     def test_graphs_that_are_none(self, steps):
@@ -277,6 +295,13 @@ class TestProcesses:
         carry_out(plan, workers, harm, Patience(1.0, 1.0, 1.0))
         assert outputs(tmp_path) == whole
         assert [error for error in heard if error] == [next(error for error in heard if says in error)]
+
+    def test_who_is_at_a_segment_goes_on_and_the_other_one_does_the_rest(self, tmp_path):
+        plan = toy_plan(tmp_path, 12, 12, seconds=0.1)
+        receipts = carry_out(plan, processes(plan))
+        assert len({receipts[f"frame-{frame}"].worker for frame in range(12)}) == 1
+        last = max(receipts[f"frame-{frame}"].ended for frame in range(12))
+        assert sum(receipts[f"materials-{frame}"].ended < last for frame in range(12)) >= 6
 
     def test_work_that_cannot_be_sent(self, tmp_path):
         plan = toy_plan(tmp_path, 1, faults={"frame-0": lambda: None})

@@ -268,8 +268,9 @@ class TestResuming:
             before_each_write(patch, keep_what_a_kill_leaves)
             reconstruct(capture, tmp_path / "whole", FakeSteps(), options)
         keep_what_a_kill_leaves()
-        # three receipts of mends, four writes of each frame, two of a seam, the report, and nothing that is killed
-        assert len(left) == 3 + 4 * 3 + 2 + 1 + 1
+        # three receipts of mends, four writes of each frame, two of a seam, the receipt of the asset, the report, and
+        # nothing that is killed
+        assert len(left) == 3 + 4 * 3 + 2 + 1 + 1 + 1
         for done, out in enumerate(left):
             leave_half_written(out)
             steps = FakeSteps()

@@ -73,8 +73,8 @@ class FakeSteps:
     masks = MaskCorrections()
     exposures = None
 
-    def __init__(self, count=60, seed=0):
-        self.count, self.seed = count, seed
+    def __init__(self, count=60, seed=0, seconds=0.0):
+        self.count, self.seed, self.seconds = count, seed, seconds
         self.calls, self.refined, self.mended, self.cameras = [], [], [], []
 
     def options(self):
@@ -118,6 +118,7 @@ class FakeSteps:
     def advance(self, track, views, progress):
         level = self.level(views)
         self.calls.append("advance")
+        time.sleep(self.seconds)
         age = track.age + 1
         velocity = 0.9 * track.velocity + 1e-4 * level / age
         cloud = track.cloud.with_arrays(positions=track.cloud.positions + velocity)

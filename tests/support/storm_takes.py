@@ -34,6 +34,10 @@ class Noted:
     def folder(self):
         return self.work.folder
 
+    @property
+    def later(self):
+        return self.work.later
+
     def common(self):
         return self.work.common()
 

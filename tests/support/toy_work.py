@@ -15,6 +15,7 @@ from beam_warp.plan.steps import Plan, Step
 class ToyWork:
     """Writes one file a step; what it read and did is told by `calls`, a file that processes append to."""
 
+    later = ()
     folder: Path
     seconds: float = 0.0
     options: str = ""

@@ -167,12 +167,17 @@ def proximity_weights(squared: NDArray[np.float64], length: float) -> NDArray[np
     return (weights / np.where(total > 0.0, total, 1.0)).astype(np.float32)
 
 
+def stable_order(keys: NDArray[np.int32], limit: int) -> NDArray[np.intp]:
+    """Return what sorts numbers from 0 to below a limit, equal ones as they stand; 16 bits are sorted far faster."""
+    return np.argsort(keys.astype(np.uint16) if limit <= 2**16 else keys, kind="stable")
+
+
 def group_by(
     groups: NDArray[np.int32], items: NDArray[np.int64], group_count: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return ``items`` ordered by ``groups[item]``, ascending in each, and where each begins, and the last ends."""
     chosen = groups[items]
-    ordered = items[np.argsort(chosen, kind="stable")]
+    ordered = items[stable_order(chosen, group_count)]
     starts = np.concatenate([[0], np.cumsum(np.bincount(chosen, minlength=group_count))])
     return ordered.astype(np.int32), starts.astype(np.int32)
 

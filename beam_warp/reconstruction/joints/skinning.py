@@ -30,6 +30,7 @@ from beam_warp.reconstruction.joints.graph import (
     joint_spacing,
     nearest_joints,
     proximity_weights,
+    stable_order,
 )
 from beam_warp.reconstruction.joints.rigidity import joint_poses
 from beam_warp.world.framing import require_points
@@ -142,6 +143,11 @@ class Skin:
         require_finite("rest_orientations", orientations)
         joints = require_points("joint_rest_positions", joint_rest_positions)
         slots, weights = _slots(anchors, len(skins), len(joints))
+        # The host is done before the first upload, which waits for whatever the device is at.
+        order = stable_order(slots[:, 0], len(joints))
+        places = np.empty(len(order), np.int32)
+        places[order] = np.arange(len(order))
+        runs = _runs(slots[order], weights[order], len(joints))
         self.blend = require_choice("blend", blend, BLENDS)
         self.device = resolve_device(device)
         self._counts = (len(skins), len(joints))
@@ -155,9 +161,10 @@ class Skin:
         self._rest.weights = upload(weights.T, float, self.device)
         self._rest.joint_positions = self.joint_rest_positions
         self._rest.dual = int(self.blend == "dual")
-        order = np.argsort(slots[:, 0], kind="stable")
-        self._rest.places = upload(np.argsort(order).astype(np.int32), int, self.device)
-        self._runs = _runs(slots[order], weights[order], len(joints), self.device)
+        self._rest.places = upload(places, int, self.device)
+        self._runs = Runs()
+        for name, array in runs.items():
+            setattr(self._runs, name, upload(array, float if name == "weights" else int, self.device))
         self._messages = Messages()
         self._messages.skins = wp.empty(MESSAGE * len(skins), dtype=wp.vec4, device=self.device)
         self._messages.run_rotations = wp.empty(len(self._runs.joints), dtype=wp.vec4, device=self.device)
@@ -250,17 +257,17 @@ def _slots(anchors: Anchors, skin_count: int, joint_count: int) -> tuple[NDArray
     return joints, weights
 
 
-def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: int, device: Any) -> Runs:
-    """Return what hangs on each joint in runs of at most `RUN` skins; skins as their messages lie."""
+def _runs(slots: NDArray[np.int32], weights: NDArray[np.float32], joint_count: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of `Runs`: what hangs on each joint in runs of at most `RUN` skins, as their messages lie."""
     pairs, starts = group_by(slots.ravel(), np.flatnonzero(weights.ravel() > 0.0), joint_count)
     runs_of = -(-np.diff(starts) // RUN)
     first_runs = np.concatenate([[0], np.cumsum(runs_of)])
     joints = np.repeat(np.arange(joint_count), runs_of)
     first_pairs = starts[joints] + RUN * (np.arange(len(joints)) - first_runs[joints])
-    runs = Runs()
-    runs.places = upload((pairs // slots.shape[1]).astype(np.int32), int, device)
-    runs.weights = upload(weights.ravel()[pairs], float, device)
-    runs.first_pairs = upload(np.append(first_pairs, len(pairs)).astype(np.int32), int, device)
-    runs.joints = upload(joints.astype(np.int32), int, device)
-    runs.first_runs = upload(first_runs.astype(np.int32), int, device)
-    return runs
+    return {
+        "places": (pairs // slots.shape[1]).astype(np.int32),
+        "weights": weights.ravel()[pairs],
+        "first_pairs": np.append(first_pairs, len(pairs)).astype(np.int32),
+        "joints": joints.astype(np.int32),
+        "first_runs": first_runs.astype(np.int32),
+    }
