@@ -67,7 +67,9 @@ class Reduce:
         int, arg(metavar="N", help="Draws of light, camera and frame for the certificate."), SECOND_PAGE
     ] = 200
     confidence: Annotated[float, arg(metavar="P", help="Confidence of the certificate."), SECOND_PAGE] = 0.95
-    views: Annotated[Annotated[int, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = 144
+    views: Annotated[Annotated[int | None, arg(metavar="N", help="Views that the search looks at.")], SECOND_PAGE] = (
+        None
+    )
     steps: Annotated[
         int | None, arg(metavar="N", help="Steps of a refit; by default 2880 on a GPU, 600 elsewhere."), SECOND_PAGE
     ] = None

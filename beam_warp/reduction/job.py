@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beam_warp import converters
 from beam_warp.checks import require_count, require_number
@@ -23,8 +22,7 @@ from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, require_flip, 
 from beam_warp.evaluate.trials import RelitTrials
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reduction.changes import Changes, changed
-from beam_warp.reduction.errors import carried_errors
+from beam_warp.reduction.changes import changed
 from beam_warp.reduction.merging import MergeOrder
 from beam_warp.reduction.pilot import fast_enough, images_a_second, steps_within
 from beam_warp.reduction.refit import refit
@@ -41,17 +39,11 @@ TRIED = 40
 """Draws of the search on which a candidate is judged: its worst is then beyond 98 % of all, as a rule."""
 
 GPU_STEPS, CPU_STEPS = 2880, 600
-"""Steps of a refit that is not told how many: on a GPU every one of the usual views is seen twenty times."""
+GPU_VIEWS, CPU_VIEWS = 288, 144
+"""Steps and views of a refit that is not told how many: on a GPU every view is seen ten times."""
 
 SAMPLE_FRAMES = 4
 """Frames, evenly over a sequence, that sensitivities are measured in."""
-
-FIRST_SHARE, FIRST_STEPS = 0.15, 0.25
-"""Share of the Gaussians that a first merge leaves, and of the steps of a refit that it gets before its errors are
-measured: what a refit mends, such as outlines and holes, needs no more Gaussians."""
-
-LEAST_ERROR = 0.01
-"""Error of a merged Gaussian over the average error that is taken at least, so that nothing merges for free."""
 
 ROUNDS, CLOSE = 6, 0.04
 """Candidates of a search at most, and how near to each other two numbers of Gaussians end it."""
@@ -103,6 +95,7 @@ class ReduceOptions:
         pairs: Draws of a light, a camera and a frame that the certificate is made on.
         confidence: Of the certificate, in (0, 1).
         views: Views on which sensitivities are measured, and which are refitted: with few, these are learnt by heart.
+            None takes `GPU_VIEWS` or `CPU_VIEWS`.
         steps: Steps of a refit; None takes `GPU_STEPS` or `CPU_STEPS`.
         target_seconds: Longest time of the call [s], with ``gaussians``: refits take as many steps as it leaves.
         spent: Part of that time that was spent before the call [s].
@@ -124,7 +117,7 @@ class ReduceOptions:
     height: int = 256
     pairs: int = 200
     confidence: float = 0.95
-    views: int = 144
+    views: int | None = None
     steps: int | None = None
     target_seconds: float | None = None
     spent: float = 0.0
@@ -155,7 +148,8 @@ class ReduceOptions:
         require_number("asset_psnr", self.asset_psnr, 5.0, 100.0)
         require_count("pairs", self.pairs, 2, MOST_PAIRS)
         require_number("confidence", self.confidence, 0.5, 0.9999)
-        require_count("views", self.views, 1, 1024)
+        if self.views is not None:
+            require_count("views", self.views, 1, 1024)
         if self.steps is not None:
             require_count("steps", self.steps, 0, 100_000)
         if self.bound is not None and not least_pairs(self.confidence) <= self.pairs:
@@ -248,7 +242,9 @@ class Reducer:
         """
         self.options, self._progress = options, progress
         self._device = resolve_device(options.device)
-        self.steps = (GPU_STEPS if self._device.is_cuda else CPU_STEPS) if options.steps is None else options.steps
+        steps, count = (GPU_STEPS, GPU_VIEWS) if self._device.is_cuda else (CPU_STEPS, CPU_VIEWS)
+        self.steps = steps if options.steps is None else options.steps
+        self.views = count if options.views is None else options.views
         count = len(original)
         self._frames = sorted({int(frame) for frame in np.linspace(0, count - 1, SAMPLE_FRAMES).round()})
         self.original = original
@@ -257,31 +253,15 @@ class Reducer:
         self._reference, self._clouds = clouds[0], clouds
         self.raster = options.raster or RasterOptions.from_metadata(original.metadata)
         self.trials = RelitTrials(environments, height=options.height, seed=options.seed, device=self._device)
-        views = self.trials.draw("search", range(options.views), self._frames)
-        lights = self.trials.draw("search", range(options.views, 3 * options.views), self._frames)
+        views = self.trials.draw("search", range(self.views), self._frames)
+        lights = self.trials.draw("search", range(self.views, 3 * self.views), self._frames)
         how = {"raster": self.raster, "device": self._device, "progress": progress}
         self.sensitivity: Sensitivity = measure_sensitivity(original, self.trials, views, lights, **how)
         self._order = MergeOrder(clouds, self.sensitivity, self._device)
-        self._order = MergeOrder(clouds, self.sensitivity, self._device, self._factors())
 
     def __len__(self) -> int:
         """Return the number of Gaussians of the original."""
         return len(self._reference)
-
-    def _factors(self) -> NDArray[np.float64]:
-        """Return factors of what merging costs, ``(N,)``, by the errors of a first merge.
-
-        Costs foresee errors only roughly. Where a merged Gaussian still shows more error than others do after some
-        steps of a refit, it should have been more than one. The factor is the root of the error over the average error:
-        its geometric mean with what was foreseen.
-        """
-        clusters, changes = self._refitted(max(1, round(FIRST_SHARE * len(self))), round(FIRST_STEPS * self.steps))
-        fitted = {
-            frame: changed(clusters.cloud(cloud), clusters.motion(cloud)[0], changes)
-            for frame, cloud in zip(self._frames, self._clouds, strict=True)
-        }
-        errors = carried_errors(fitted, self.sensitivity, raster=self.raster, device=self._device)
-        return np.sqrt(np.maximum(errors / max(errors.mean(), 1e-30), LEAST_ERROR))[clusters.labels]
 
     def reduced(self, count: int, *, steps: int | None = None) -> GaussianSequence:
         """Return the asset of a number of Gaussians; frames are made as they are read.
@@ -292,7 +272,14 @@ class Reducer:
         """
         if count >= len(self):
             return replace(self.original, read_frame=lambda frame: world(self.original, frame))
-        clusters, changes = self._refitted(count, self.steps if steps is None else steps)
+        clusters = Clusters(self._reference, self._order.labels(count), self.sensitivity.visible)
+        merged = {
+            frame: (clusters.cloud(cloud), clusters.motion(cloud)[0])
+            for frame, cloud in zip(self._frames, self._clouds, strict=True)
+        }
+        number = self.steps if steps is None else steps
+        how = {"raster": self.raster, "device": self._device, "progress": self._progress}
+        changes = refit(merged, self.sensitivity, steps=number, **how)
 
         @lru_cache(SAMPLE_FRAMES)
         def read(frame: int) -> GaussianCloud:
@@ -301,16 +288,6 @@ class Reducer:
 
         constant = self.original.constant if len(self.original) > 1 else frozenset()
         return replace(self.original, read_frame=read, constant=constant)
-
-    def _refitted(self, count: int, steps: int) -> tuple[Clusters, Changes]:
-        """Return clusters of a number, and what a refit of so many steps changes of them."""
-        clusters = Clusters(self._reference, self._order.labels(count), self.sensitivity.visible)
-        merged = {
-            frame: (clusters.cloud(cloud), clusters.motion(cloud)[0])
-            for frame, cloud in zip(self._frames, self._clouds, strict=True)
-        }
-        how = {"raster": self.raster, "device": self._device, "progress": self._progress}
-        return clusters, refit(merged, self.sensitivity, steps=steps, **how)
 
 
 def reduce_asset(
@@ -410,7 +387,7 @@ class _Search:
         self.tried: list[tuple[int, float]] = []
         self._stored = 0
         self._made: dict[tuple[int, int], GaussianSequence] = {}
-        start = 3 * reducer.options.views
+        start = 3 * reducer.views
         self._draws = reducer.trials.draw("search", range(start, start + TRIED), range(len(reducer.original)))
         self.timed = self._draws[:DRAWN]
         self._delivers = format_of(place).name == "b4d"

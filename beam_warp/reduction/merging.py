@@ -44,27 +44,19 @@ class MergeOrder:
     Source: Ward 1963; Murtagh 1983 (mutual nearest neighbours).
     """
 
-    def __init__(
-        self,
-        clouds: Sequence[GaussianCloud],
-        found: Sensitivity,
-        device: Any = None,
-        factors: NDArray[np.floating] | None = None,
-    ) -> None:
+    def __init__(self, clouds: Sequence[GaussianCloud], found: Sensitivity, device: Any = None) -> None:
         """Begin with every Gaussian by itself.
 
         Args:
             clouds: Some frames of a constant topology, in the world's axes.
             found: What their images depend on.
             device: Warp device on which costs are found.
-            factors: Of what merging each Gaussian costs, ``(N,)``; 1 without.
         """
         count = len(clouds[0])
         self._pixel, self._count, self._device = found.pixel, count, resolve_device(device)
         self._weights = found.visible.astype(np.float64) + 1e-6 * (1.0 + float(found.visible.mean()))
-        factors = np.ones(count, np.float32) if factors is None else factors.astype(np.float32)
-        self._edges = factors * (found.edges + FLOOR * self._weights)
-        self._forms = factors[:, None, None] * found.materials
+        self._edges = found.edges + FLOOR * self._weights
+        self._forms = found.materials.copy()
         self._materials = np.stack([material_rows(cloud) for cloud in clouds]).astype(np.float64)
         self._places = np.stack([cloud.positions for cloud in clouds]).astype(np.float64)
         self._heads = np.arange(count)

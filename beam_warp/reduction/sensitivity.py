@@ -26,7 +26,6 @@ from beam_warp.kernels.reduction.image_forms import (
     launch_add_edges,
     launch_add_forms,
     launch_carry,
-    launch_form_errors,
     launch_form_slopes,
     launch_nudge,
 )
@@ -92,15 +91,9 @@ class SeenView:
 
     def slopes(self, images: RasterImages, out: RasterImages) -> None:
         """Write the derivatives of the error of what another asset shows to ``out``."""
+        known = (self.places, self.forms, self.target, self.alpha, EMPTY_WEIGHT)
         found = (images.channels[0], images.alpha, out.channels[0], out.alpha)
-        launch_form_slopes(len(self.alpha), *self._known(), *found, self.alpha.device)
-
-    def errors(self, images: RasterImages, out: wp.array) -> None:
-        """Write the error of every pixel of what another asset shows to the first column of ``out``, ``(P, K)``."""
-        launch_form_errors(len(self.alpha), *self._known(), images.channels[0], images.alpha, out, self.alpha.device)
-
-    def _known(self) -> tuple[Any, ...]:
-        return self.places, self.forms, self.target, self.alpha, EMPTY_WEIGHT
+        launch_form_slopes(len(self.alpha), *known, *found, self.alpha.device)
 
 
 @dataclass(frozen=True, eq=False)

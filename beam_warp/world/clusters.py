@@ -29,7 +29,6 @@ class Clusters:
     the pixels in which members are seen. Clusters move by the mean of their members' motions.
 
     Attributes:
-        labels: The cluster of every Gaussian, ``(N,)``.
         heaviest: Row of the member of each cluster that is worth most, ``(K,)``.
     """
 
@@ -41,15 +40,15 @@ class Clusters:
             labels: The cluster of every Gaussian, 0 … K - 1, each at least once; ``(N,)``.
             visible: Pixels that each Gaussian is worth, ``(N,)``.
         """
-        self._reference, self.labels = reference, np.asarray(labels)
+        self._reference, self._labels = reference, np.asarray(labels)
         mass = optical_mass(reference)
         self._mass = self._shares(mass + 1e-9 * mass.max(initial=1e-30))
         seen = np.asarray(visible, np.float64)
         self._seen = self._shares(
             seen + 1e-6 * (mass / max(mass.max(initial=0.0), 1e-30) + 1e-3) * (seen.mean() + 1e-9)
         )
-        order = np.lexsort((np.arange(len(mass)), -(seen + 1e-9 * mass), self.labels))
-        self.heaviest = order[np.flatnonzero(np.diff(self.labels[order], prepend=-1))]
+        order = np.lexsort((np.arange(len(mass)), -(seen + 1e-9 * mass), self._labels))
+        self.heaviest = order[np.flatnonzero(np.diff(self._labels[order], prepend=-1))]
         self._orientations, self._scales, self._depth = self._shapes(mass)
 
     def __len__(self) -> int:
@@ -58,24 +57,24 @@ class Clusters:
 
     def _shares(self, weight: FloatArray) -> csr_array:
         """Return the matrix that takes the weighted mean of every cluster, ``(K, N)``."""
-        total = np.bincount(self.labels, weight)
-        entries = weight / total[self.labels]
-        return csr_array((entries, (self.labels, np.arange(len(weight)))), shape=(len(total), len(weight)))
+        total = np.bincount(self._labels, weight)
+        entries = weight / total[self._labels]
+        return csr_array((entries, (self._labels, np.arange(len(weight)))), shape=(len(total), len(weight)))
 
     def _shapes(self, mass: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return orientations, scales and optical depths of the clusters in the reference frame."""
         cloud = self._reference
         axes = rotation_matrices(cloud.orientations) * cloud.scales[:, None, :].astype(np.float64)
         places = cloud.positions.astype(np.float64)
-        away = places - (self._mass @ places)[self.labels]
+        away = places - (self._mass @ places)[self._labels]
         spread = axes @ axes.transpose(0, 2, 1) + away[:, :, None] * away[:, None, :]
         squares, turned = np.linalg.eigh((self._mass @ spread.reshape(-1, 9)).reshape(-1, 3, 3))
         turned[:, :, 2] *= np.sign(np.linalg.det(turned))[:, None]
         orientations, scales = Rotation.from_matrix(turned).as_quat(), np.sqrt(np.maximum(squares, 0.0))
-        alone = np.bincount(self.labels)[self.labels[self.heaviest]] == 1
+        alone = np.bincount(self._labels)[self._labels[self.heaviest]] == 1
         orientations[alone] = cloud.orientations[self.heaviest[alone]]
         scales[alone] = cloud.scales[self.heaviest[alone]]
-        depth = np.bincount(self.labels, mass) / np.maximum(shown_area(scales), 1e-30)
+        depth = np.bincount(self._labels, mass) / np.maximum(shown_area(scales), 1e-30)
         deepest = -np.log1p(-MOST_OPACITY)
         wider = np.where(alone, 1.0, np.sqrt(np.maximum(depth / deepest, 1.0)))
         larger = np.argsort(np.argsort(scales, axis=1), axis=1) > 0  # the two that lie in the surface
@@ -103,7 +102,7 @@ class Clusters:
         else:
             since = Rotation.from_quat(frame.orientations) * Rotation.from_quat(self._reference.orientations).inv()
             rows = since.as_quat()
-            rows *= np.where((rows * rows[self.heaviest][self.labels]).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+            rows *= np.where((rows * rows[self.heaviest][self._labels]).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
             turns = self._mass @ rows
         return Rotation.from_quat(turns), self._mass @ frame.positions.astype(np.float64)
 
@@ -115,7 +114,7 @@ class Clusters:
         rows = array.reshape(len(array), -1).astype(np.float64)
         if name.endswith("_error"):  # what is known of one member, and how far members are apart
             value = getattr(frame, name.removesuffix("_error")).reshape(len(array), -1).astype(np.float64)
-            apart = value - (self._seen @ value)[self.labels]
+            apart = value - (self._seen @ value)[self._labels]
             found = np.sqrt(self._seen @ (np.square(rows) + np.square(apart)))
         else:
             found = self._seen @ rows

@@ -161,45 +161,9 @@ def form_slopes_kernel(
     out_alpha[i] = 2.0 * found[MATERIALS]
 
 
-@wp.kernel
-def form_errors_kernel(
-    first: int,
-    places: wp.array[int],
-    forms: wp.array2d[float],
-    target: wp.array2d[float],
-    target_alpha: wp.array[float],
-    empty_weight: float,
-    channels: wp.array2d[float],
-    alpha: wp.array[float],
-    out_pixels: wp.array2d[float],
-):
-    """The errors d^T M d whose derivatives `form_slopes_kernel` finds, in the first column; zeros in the others."""
-    i = first + wp.tid()
-    place = places[i]
-    away = alpha[i] - target_alpha[i]
-    found = empty_weight * away * away
-    if place >= 0:
-        error = Sums()
-        for k in range(MATERIALS):
-            error[k] = channels[i, k] - target[i, k]
-        error[MATERIALS] = away
-        found = float(0.0)
-        entry = int(0)
-        for row in range(COLUMNS):
-            for column in range(row):
-                found += 2.0 * forms[place, entry] * error[row] * error[column]
-                entry += 1
-            found += forms[place, entry] * error[row] * error[row]
-            entry += 1
-    out_pixels[i, 0] = found
-    for k in range(1, out_pixels.shape[1]):
-        out_pixels[i, k] = 0.0
-
-
 launch_nudge = launcher(nudge_kernel)
 launch_add_forms = launcher(add_forms_kernel)
 launch_add_edges = launcher(add_edges_kernel)
 launch_carry = launcher(carry_kernel)
 launch_add_columns = launcher(add_columns_kernel)
 launch_form_slopes = launcher(form_slopes_kernel)
-launch_form_errors = launcher(form_errors_kernel)

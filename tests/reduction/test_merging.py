@@ -63,16 +63,6 @@ def test_a_pair_costs_what_ward_says_of_relit_images():
     assert costs[7] == pytest.approx(expected, rel=1e-4)
 
 
-def test_factors_multiply_what_merging_costs():
-    rng, cloud = np.random.default_rng(0), floor(np.random.default_rng(1).uniform(size=(SIDE * SIDE, 3)))
-    found = even(len(cloud))
-    pairs, costs = MergeOrder([cloud], found)._costs()
-    assert MergeOrder([cloud], found, factors=np.full(len(cloud), 3.0))._costs()[1] == pytest.approx(3.0 * costs)
-    factors = rng.uniform(0.5, 2.0, len(cloud))
-    found = MergeOrder([cloud], found, factors=factors)._costs()[1]  # all are worth the same: the mean of two
-    assert found == pytest.approx(0.5 * factors[pairs].sum(axis=1) * costs, rel=1e-4)
-
-
 def test_what_looks_different_is_merged_last():
     colors = np.where(np.arange(SIDE * SIDE)[:, None] // SIDE < 4, 0.1, 0.9) * np.ones(3)
     labels = MergeOrder([floor(colors)], even(SIDE * SIDE)).labels(2)
