@@ -149,11 +149,13 @@ def _axis_label(series: str) -> str:
 
 def _log_axes(axes: Any) -> None:
     """Make both axes logarithmic, with plain numbers."""
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set(xscale="log", yscale="log")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda number, _: short_number(number)))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(True, which="major", alpha=0.4)
     axes.grid(True, which="minor", alpha=0.12)
 
