@@ -1,6 +1,6 @@
 """What do rays bring where they are needed, instead of as many for every Gaussian: error, bias, time and scores?
 
-    python benchmarks/economy.py [--device cuda:0] [--parts light occlusion bounce frames] --out JSON
+    python benchmarks/economy.py [--device cuda:0] [--parts light occlusion bounce pilot] --out JSON
     python benchmarks/economy.py --parts views --made DIR --out JSON
 
 Materials of Gaussians on the true surface of three captures and of the demo's are measured with every Gaussian's light
@@ -10,8 +10,8 @@ rays for each have the same error, between those that were measured. *Stopped* i
 once its own rays agree; and *occlusion* is what the same rule would bring there. Both are looked up in the runs with as
 many rays for each, whose sets begin alike. Seconds are of measuring all materials of the frame, in turn. *Bounce* is
 the error of the bounced light over all light: without it, by as many rays for each, and by as many as it needs.
-*Frames* is roughness of Gaussians that keep their places on the surface, from all frames and from as many as change it,
-and what a pilot costs the first capture, and saves a white ball under even light, which says nothing of it. *Views* is
+*Pilot* is what a pilot of roughness costs the first capture, and saves a white ball under even light, which says
+nothing of it. *Views* is
 base colour of a reconstruction, DIR/NAME/reconstruction as `beam run` leaves it, by all training views and by some; its
 change is relative to the error that it states with all. Seconds of both are those of the processor.
 """
@@ -232,29 +232,6 @@ def bounce_of(subject: Subject, rays: int, device: Any, repeats: int) -> list[di
     return rows
 
 
-def frames_of(capture: Capture, count: int, device: Any) -> list[dict[str, Any]]:
-    """Return roughness from all frames, and from as many as change it, of Gaussians that keep their places."""
-    numbers = sorted({record.frame for record in capture.select(split="train")})
-    assert capture.environment_path is not None
-    light = PreparedEnvironment(EnvironmentMap.read(capture.environment_path), device)
-    seen = [seen_frame(capture, number, numbers[0], count, device) for number in numbers]
-    truth = PerfectFrame(capture, numbers[0], seen[0].cloud, seen[0].scene, (), seen[0].views).true_roughness(device)
-    rows = []
-    for name, part in (("all frames", 0.0), ("as many as change it", roughness_finder.PART)):
-        with changed("beam_warp.decomposition.roughness_finder:PART", part):
-            rows.append(roughness_row(name, seen, light) | {"of": len(seen)})
-        off = (rows[-1]["found"].roughness - truth)[seen[0].points.seen]
-        rows[-1]["psnr"] = float(-20.0 * np.log10(root_mean_square(off)))
-    return compared(rows)
-
-
-def compared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows without their estimates, and by how much the other ones differ from the first one."""
-    for row in rows[1:]:
-        row["change"] = root_mean_square(row["found"].roughness - rows[0]["found"].roughness)
-    return [{key: value for key, value in row.items() if key != "found"} for row in rows]
-
-
 def pilot_of(capture: Capture, device: Any) -> dict[str, list[dict[str, Any]]]:
     """Return what a pilot costs where views say something, and saves where they say nothing: on a white ball."""
     assert capture.environment_path is not None
@@ -262,16 +239,14 @@ def pilot_of(capture: Capture, device: Any) -> dict[str, list[dict[str, Any]]]:
     even = PreparedEnvironment(EnvironmentMap.constant((1.0, 1.0, 1.0)), device)
     frame = truth_frames(capture)[0]
     subjects = {
-        "walker": (seen_frame(capture, frame, frame, PILOTED, device), light),
+        "walker": (seen_frame(capture, frame, PILOTED, device), light),
         "white ball": (white_ball(PILOTED, device), even),
     }
-    found = {}
+    found: dict[str, list[dict[str, Any]]] = {}
     for name, (seen, shining) in subjects.items():
-        rows = []
         for words, saved in (("without a pilot", 10**9), ("with a pilot", roughness_finder.LEAST_SAVED)):
             with changed("beam_warp.decomposition.roughness_finder:LEAST_SAVED", saved):
-                rows.append(roughness_row(words, [seen], shining) | {"of": 1})
-        found[name] = compared(rows)
+                found.setdefault(name, []).append(roughness_row(words, seen, shining))
     return found
 
 
@@ -288,12 +263,11 @@ def white_ball(count: int, device: Any) -> SimpleNamespace:
     return SimpleNamespace(number=0, cloud=cloud, scene=scene, points=points, views=None, log=log)
 
 
-def seen_frame(capture: Capture, number: int, first: int, count: int, device: Any) -> SimpleNamespace:
-    """Return a frame as the main job sees it: Gaussians on the true surface, spread over that of the first frame."""
-    meshes = [read_truth_mesh(capture, frame) for frame in (number, first)]
-    vertices, rest = (np.asarray(mesh.vertices) for mesh in meshes)
+def seen_frame(capture: Capture, number: int, count: int, device: Any) -> SimpleNamespace:
+    """Return a frame as the main job sees it, of Gaussians on the true surface."""
+    mesh = read_truth_mesh(capture, number)
     views = [record.view() for record in capture.select(split="train", frames={number})]
-    bare = gaussians_on_mesh(vertices, np.asarray(meshes[0].faces), count, rest=rest)
+    bare = gaussians_on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), count)
     cloud, cameras = colored_by_views(bare, views, options=SHARP, device=str(device)), [v.camera for v in views]
     scene, evidence = (
         Scene.from_gaussians(cloud, str(device)),
@@ -304,20 +278,17 @@ def seen_frame(capture: Capture, number: int, first: int, count: int, device: An
     return SimpleNamespace(number=number, cloud=cloud, scene=scene, points=points, views=evidence, log=log)
 
 
-def roughness_row(name: str, seen: list[SimpleNamespace], light: PreparedEnvironment) -> dict[str, Any]:
-    """Return an estimate, what it says of frames that were left out, and the seconds of the processor that it took."""
+def roughness_row(name: str, seen: SimpleNamespace, light: PreparedEnvironment) -> dict[str, Any]:
+    """Return what an estimate from a frame says of itself, and the seconds of the processor that it took."""
     plan = SimpleNamespace(
         light=SimpleNamespace(prepared=light),
         source=SimpleNamespace(options=SimpleNamespace(gathering=MaterialOptions())),
     )
-    order = roughness_finder.asked_frames(len(seen))
     started = time.process_time()
-    asked = (seen[place] for place in order)
-    profiles = roughness_finder.profiles_of(plan, asked, len(seen))  # type: ignore[arg-type]
-    found = roughness_finder.find_roughness(seen[order[0]].cloud.positions, profiles, len(seen))
-    told = {key: found.report[key] for key in ("frames", "left_out_change", "informed_part")}
-    stated = root_mean_square(found.standard_error)
-    return {"name": name, "found": found, "seconds": time.process_time() - started, "stated": stated} | told
+    profiles = roughness_finder.profiles_of(plan, [seen], 1)  # type: ignore[arg-type, list-item]
+    found = roughness_finder.find_roughness(seen.cloud.positions, profiles)
+    row = {"name": name, "seconds": time.process_time() - started, "stated": root_mean_square(found.standard_error)}
+    return row | {"frames": found.report["frames"], "of": 1, "informed_part": found.report["informed_part"]}
 
 
 def views_of(capture: Capture, made: Path, device: Any) -> list[dict[str, Any]]:
@@ -350,7 +321,7 @@ def views_of(capture: Capture, made: Path, device: Any) -> list[dict[str, Any]]:
     return rows
 
 
-PARTS = ("light", "occlusion", "bounce", "frames")
+PARTS = ("light", "occlusion", "bounce", "pilot")
 
 
 def main() -> None:
@@ -373,13 +344,12 @@ def main() -> None:
             else:
                 capture = Capture.read(Path(given.data) / "captures" / name)
             rows[name] = {}
-            if "frames" in given.parts:
+            if "pilot" in given.parts:
                 pilot = pilot or pilot_of(capture, device)
-                rows[name]["frames"] = frames_of(capture, given.gaussians, device)
             if "views" in given.parts:
                 rows[name]["views"] = views_of(capture, given.made / name, device)
             record.write_result(given, device, {"captures": rows, "pilot": pilot})
-            for row in [*rows[name].get("frames", ()), *rows[name].get("views", ())]:
+            for row in rows[name].get("views", ()):
                 print(name, row, flush=True)
             if not {"light", "occlusion", "bounce"} & {*given.parts}:
                 continue

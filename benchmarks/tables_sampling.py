@@ -110,17 +110,14 @@ def economy_bounce(result: Row) -> Rows:
     return rows
 
 
-@table("economy_frames", "economy_frames_cpu.json")
-def economy_frames(result: Row) -> Rows:
-    """Roughness from all frames and from as many as change it; and what a pilot costs and saves."""
-    rows: list[list[Any]] = [["", "frames", "s", "roughness", "stated error", "left out: said", "true"]]
-    captures = {name: found["frames"] for name, found in result["captures"].items()}
-    for name, found in (*captures.items(), *result["pilot"].items()):
+@table("economy_pilot", "economy_frames_cpu.json")
+def economy_pilot(result: Row) -> Rows:
+    """What a pilot costs and saves."""
+    rows: list[list[Any]] = [["", "frames", "s", "stated error"]]
+    for name, found in result["pilot"].items():
         for row in found:
-            score = f"{row['psnr']:.2f} dB" if "psnr" in row else ""
-            cells = [f"{row['frames']} of {row['of']}", f"{row['seconds']:.1f}", score, f"{row['stated']:.3f}"]
-            said = [f"{row[key]:.4f}" if "change" in row else "" for key in ("left_out_change", "change") if key in row]
-            rows.append([f"{name}, {row['name']}", *cells, *(said if len(said) == 2 else ["", ""])])
+            cells = [f"{row['frames']} of {row['of']}", f"{row['seconds']:.1f}", f"{row['stated']:.3f}"]
+            rows.append([f"{name}, {row['name']}", *cells])
     return rows
 
 

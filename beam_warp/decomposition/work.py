@@ -363,7 +363,7 @@ class MaterialWork:
             write_frame(self.stored("roughness"), {})
             return {}
         profiles = filter(None, map(self.archive.profile, self._asked))
-        estimate = find_roughness(self.source.first.cloud.positions, profiles, len(self._asked))
+        estimate = find_roughness(self.source.first.cloud.positions, profiles)
         write_frame(self.stored("roughness"), _roughness_arrays(estimate))
         return {"roughness": estimate.report}
 
@@ -428,7 +428,7 @@ class MaterialWork:
         shared = read_frame(self.stored("roughness")) if self._may_be_persistent else {}
         if shared:
             return shared
-        estimate = find_roughness(frame.cloud.positions, profiles_of(self.job, [frame], 1), 1)
+        estimate = find_roughness(frame.cloud.positions, profiles_of(self.job, [frame], 1))
         facts["roughness"] = estimate.report
         return _roughness_arrays(estimate)
 
