@@ -187,7 +187,7 @@ def matte(
     common, edge = 0.0, AS_IT_IS
     contrast = np.square(inner.values - outer.values).sum(axis=1)
     if offset is not None:
-        worth = contrast / (inner.variances + outer.variances)[outline.nearest]
+        worth = contrast / (inner.variances + outer.variances + 1e-10)[outline.nearest]
         common, edge = _mended(mask, outline, offset, EdgeEvidence(at, outline.distances, shown, worth))
     whole = edge.redrawn(_moved_evenly(mask, outline, common), at)
     parts = edge.redrawn(_moved(mask, outline, common + own), at) if own.any() else whole
