@@ -37,6 +37,9 @@ BLACK = 1e-4
 MASK_PIXELS, MASK_ERRORS = 0.5, 3.0
 """Masks that are off by more than so many pixels and so many standard errors are reported."""
 
+STEEPER = 1.5
+"""Outlines that are made so many times steeper, or filtered, are reported."""
+
 SOFT_PIXELS, SURELY_SOFT = 0.4, 0.7
 """Blur that is reported [pixel]: the first where coverage shows it, or the median of all photographs does; the second
 of a single photograph, whose shading widens edges by up to 0.5. A circle of confusion of two pixels is 0.5, and costs
@@ -69,7 +72,7 @@ class Glimpse:
             an image without a subject, or a black one.
         coverage: Mean alpha; None if it is unknown.
         quality: How sharp and how noisy it is.
-        mask_offset: How far the mask reached beyond the subject; None if nothing tells.
+        mask_offset: How far the mask reached beyond the subject, and how it was redrawn; None if nothing tells.
     """
 
     record: CaptureRecord
@@ -232,7 +235,7 @@ def _judge_coverage(glimpses: Sequence[Glimpse], findings: Findings) -> None:
 
 
 def _judge_outlines(glimpses: Sequence[Glimpse], findings: Findings) -> None:
-    """Find cameras whose masks end elsewhere than the subject does."""
+    """Find cameras whose masks end elsewhere than the subject does, or are not as soft."""
     by_camera: dict[str, list[MaskOffset]] = defaultdict(list)
     for glimpse in glimpses:
         if glimpse.mask_offset is not None:
@@ -244,6 +247,20 @@ def _judge_outlines(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     wrong = {name: found for name, found in off.items() if abs(found[0]) > max(MASK_PIXELS, MASK_ERRORS * found[1])}
     if wrong:
         findings.append(offset_finding({name: MaskOffset(*found) for name, found in wrong.items()}))
+    redrawn = [name for name, offsets in by_camera.items() if name not in wrong and _are_redrawn(offsets)]
+    if redrawn:
+        findings.warn(
+            "mask-softness",
+            f"masks of {count_of(len(redrawn), 'camera')} are all or nothing, or softer than the subject is in its "
+            "photographs: their outlines are redrawn",
+            redrawn,
+            "Export the coverage of every pixel, neither thresholded nor feathered nor resized.",
+        )
+
+
+def _are_redrawn(offsets: Sequence[MaskOffset]) -> bool:
+    """Tell whether the outlines of most masks are filtered, or made much steeper."""
+    return 2 * sum(found.edge.blur > 0.0 or found.edge.gain >= STEEPER for found in offsets) > len(offsets)
 
 
 def offset_finding(offsets: Mapping[str, MaskOffset]) -> Finding:

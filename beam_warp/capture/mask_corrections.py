@@ -7,7 +7,7 @@ back to the photographs later sees the subject that the Gaussians were fitted to
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from beam_warp.capture.capture import CaptureRecord
@@ -42,7 +42,9 @@ class MaskCorrections(SideFile):
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-able record, which `from_dict` takes."""
-        return {"cameras": {name: asdict(offset) for name, offset in self.offsets.items()}}
+        return {
+            "cameras": {name: {"pixels": found.pixels, "error": found.error} for name, found in self.offsets.items()}
+        }
 
     @classmethod
     def from_dict(cls, content: Any) -> MaskCorrections:

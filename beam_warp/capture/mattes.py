@@ -21,7 +21,7 @@ Digital Matting") give the subject's part: I - (1 - a) B before a smooth backdro
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -104,15 +104,17 @@ ALL_OF_A_MASK, ALL_OF_A_PART = 4.0, 6.0
 
 @dataclass(frozen=True)
 class MaskOffset:
-    """How far a mask reaches beyond the subject, as a photograph shows it.
+    """How far a mask reaches beyond the subject, as a photograph shows it, and how soft its outline should be.
 
     Attributes:
         pixels: Mean of the closest half along the outline [pixel]; negative for a mask that is too small.
         error: Its standard error [pixel].
+        edge: How the outline is redrawn.
     """
 
     pixels: float
     error: float
+    edge: Edge = AS_IT_IS
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +191,7 @@ def matte(
     if offset is not None:
         worth = contrast / (inner.variances + outer.variances + 1e-10)[outline.nearest]
         common, edge = _mended(mask, outline, offset, EdgeEvidence(at, outline.distances, shown, worth))
+        offset = replace(offset, edge=edge)
     whole = edge.redrawn(_moved_evenly(mask, outline, common), at)
     parts = edge.redrawn(_moved(mask, outline, common + own), at) if own.any() else whole
     alpha = (0.5 * (whole + parts)).astype(np.float32)

@@ -221,6 +221,16 @@ def test_masks_that_are_off_are_named_with_their_cameras(tmp_path):
     assert finding.what.startswith("masks of 2 cameras end outside")
 
 
+def test_feathered_masks_are_named_with_their_cameras(tmp_path):
+    photographed(tmp_path, {"c02": 1.0})
+    for camera in ("c02", "c05"):
+        for path in (tmp_path / "masks").rglob(f"{camera}*/*.png"):
+            PillowImage.fromarray(gaussian_filter(np.array(PillowImage.open(path)), 1.2)).save(path)
+    offset, softness = inspect_capture(Capture.read(tmp_path)).findings
+    assert (offset.code, softness.severity, softness.code) == ("mask-offset", "warning", "mask-softness")
+    assert softness.where == "c05"
+
+
 def test_colour_under_a_clear_alpha_is_the_backdrop(tmp_path):
     photographed(tmp_path, {})
     record = Capture.read(tmp_path).records[0]
