@@ -240,13 +240,12 @@ def _judge_outlines(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     for glimpse in glimpses:
         if glimpse.mask_offset is not None:
             by_camera[glimpse.record.camera_name].append(glimpse.mask_offset)
-    off = {
-        name: tuple(float(np.median([getattr(found, part) for found in offsets])) for part in ("pixels", "error"))
-        for name, offsets in by_camera.items()
+    off = {name: _middle_of(offsets) for name, offsets in by_camera.items()}
+    wrong = {
+        name: found for name, found in off.items() if abs(found.pixels) > max(MASK_PIXELS, MASK_ERRORS * found.error)
     }
-    wrong = {name: found for name, found in off.items() if abs(found[0]) > max(MASK_PIXELS, MASK_ERRORS * found[1])}
     if wrong:
-        findings.append(offset_finding({name: MaskOffset(*found) for name, found in wrong.items()}))
+        findings.append(offset_finding(wrong))
     redrawn = [name for name, offsets in by_camera.items() if name not in wrong and _are_redrawn(offsets)]
     if redrawn:
         findings.warn(
@@ -256,6 +255,12 @@ def _judge_outlines(glimpses: Sequence[Glimpse], findings: Findings) -> None:
             redrawn,
             "Export the coverage of every pixel, neither thresholded nor feathered nor resized.",
         )
+
+
+def _middle_of(offsets: Sequence[MaskOffset]) -> MaskOffset:
+    """Return the median offset, and the median of the errors."""
+    pixels, errors = zip(*((found.pixels, found.error) for found in offsets), strict=True)
+    return MaskOffset(float(np.median(pixels)), float(np.median(errors)))
 
 
 def _are_redrawn(offsets: Sequence[MaskOffset]) -> bool:
