@@ -17,7 +17,7 @@ SOLID = 0.5
 """The outline runs where coverage passes this value."""
 
 BLURS = (0.0, 0.5, 0.7, 1.0, 1.4)
-GAINS = (*np.linspace(1.0, 3.0, 17).tolist(),)
+GAINS = tuple(1.0 + step / 8.0 for step in range(17))
 """Standard deviations of the filter that a mask passes first [pixel], and how many times steeper it is made then."""
 
 NEAR = 1.5

@@ -432,7 +432,7 @@ def _mended(
     coverage = mask[evidence.at]
     is_hard = not ((coverage > FAINT) & (coverage < 1.0 - FAINT)).any()
     _, better = evidence.best_edge(_moved_evenly(mask, outline, pixels), pixels)
-    if better > ALL_OF_A_MASK:  # it is not the photograph's coverage, so that no place is as likely as the one it has
+    if better > ALL_OF_A_MASK:  # it is wrong for sure, so that nothing speaks for the place that it has
         common = pixels * max(1.0 - error**2 / max(pixels**2, 1e-12), 0.0)
     else:
         common = float(_beyond(np.array(pixels), np.array(error), ALL_OF_A_MASK))

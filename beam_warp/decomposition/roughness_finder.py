@@ -33,16 +33,8 @@ LEAST_SAVED = 16
 
 
 def asked_frames(count: int) -> list[int]:
-    """Return the numbers of the frames that the roughness of persistent Gaussians is found from, of so many.
-
-    Each is as far from those before it as it can be, so that the first few are spread over the take as well.
-    """
-    left = sorted({round(place) for place in np.linspace(0, count - 1, min(count, ROUGHNESS_FRAMES))})
-    order = [left.pop(0)]
-    while left:
-        distances = [min(abs(number - other) for other in order) for number in left]
-        order.append(left.pop(int(np.argmax(distances))))
-    return order
+    """Return the numbers of the frames that the roughness of persistent Gaussians is found from, of so many."""
+    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, ROUGHNESS_FRAMES))})
 
 
 def find_roughness(positions: NDArray[np.float32], profiles: Iterable[RoughnessProfile]) -> RoughnessEstimate:

@@ -9,6 +9,7 @@ from PIL import Image as PillowImage
 
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import srgb_to_linear
+from beam_warp.image.files import read_image
 from beam_warp.stability.flaws.mattes import blotted_coverage, offset_coverage
 from beam_warp.stability.flaws.optics import defocused, distorted, motion_blurred, radial_coefficient
 from beam_warp.stability.flaws.rig import CameraFlaws, draw_camera_flaws
@@ -251,6 +252,11 @@ class TestWrite:
         copy = flawed("blots", "plate", size=0.5)
         found = [np.abs(mine.alpha - clean.alpha).max() > 0.9 for mine, clean in views(copy.capture, tiny_capture)]
         assert 0 < sum(found) < 0.6 * len(found)
+
+    def test_hard_masks_are_all_or_nothing(self, flawed):
+        masks = [read_image(record.mask_path).rgb() for record in flawed("hard-masks").capture.records]
+        assert len(masks) > 1
+        assert all(set(np.unique(mask)) == {0.0, 1.0} for mask in masks)
 
     def test_light_is_turned_and_brighter(self, flawed, tiny_capture):
         copy = flawed("light", size=2.0)
