@@ -110,7 +110,7 @@ def economy_bounce(result: Row) -> Rows:
     return rows
 
 
-@table("economy_pilot", "economy_frames_cpu.json")
+@table("economy_pilot", "economy_pilot_cpu.json")
 def economy_pilot(result: Row) -> Rows:
     """What a pilot costs and saves."""
     rows: list[list[Any]] = [["", "frames", "s", "stated error"]]
