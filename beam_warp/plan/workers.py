@@ -43,8 +43,11 @@ UNKNOWN_END = 255
 IDLE = 0.25
 """Time without a task after which a process imports what it may need later [s]."""
 
-MOST_STARTS = 10
-"""Times that a process is started anew because its server was killed meanwhile."""
+PAUSES = tuple(0.001 * 2**count for count in range(12))
+"""Times to wait before a process is started anew, since the server was killed meanwhile [s].
+
+A server that is being killed refuses at once, but counts as running until the system has taken it down.
+"""
 
 
 @dataclass(frozen=True)
@@ -296,15 +299,16 @@ class Processes:
         """Return the numbers of the processes that live, for tests that kill some."""
         return [member.process.pid or 0 for member in self._members if member.process.is_alive()]
 
-    def _member(self, setting: Mapping[str, str], tries: int = MOST_STARTS) -> _Member:
+    def _member(self, setting: Mapping[str, str], pauses: Sequence[float] = PAUSES) -> _Member:
         here, there = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(there, {**os.environ, **setting}), daemon=True)
         try:
             process.start()
         except (EOFError, OSError):  # the server was killed
-            if tries == 1:
+            if not pauses:
                 raise
-            return self._member(setting, tries - 1)
+            time.sleep(pauses[0])
+            return self._member(setting, pauses[1:])
         there.close()
         with suppress(OSError):
             here.send_bytes(self._packed)

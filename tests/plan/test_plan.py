@@ -11,6 +11,7 @@ import time
 import tracemalloc
 from contextlib import suppress
 from dataclasses import replace
+from multiprocessing import forkserver
 from pathlib import Path
 
 import psutil
@@ -295,6 +296,21 @@ class TestProcesses:
         carry_out(plan, workers, harm, Patience(1.0, 1.0, 1.0))
         assert outputs(tmp_path) == whole
         assert [error for error in heard if error] == [next(error for error in heard if says in error)]
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="processes are not forked")
+    def test_a_server_that_refuses_while_it_is_taken_down(self, tmp_path, whole, monkeypatch):
+        """For a while the killed server counts as running, so that no other one is started."""
+        connect, end = forkserver.connect_to_new_process, time.monotonic() + 0.3
+
+        def late(fds):
+            if time.monotonic() < end:
+                raise ConnectionRefusedError
+            return connect(fds)
+
+        monkeypatch.setattr("multiprocessing.popen_forkserver.forkserver.connect_to_new_process", late)
+        plan = toy_plan(tmp_path)
+        carry_out(plan, processes(plan))
+        assert outputs(tmp_path) == whole
 
     def test_who_is_at_a_segment_goes_on_and_the_other_one_does_the_rest(self, tmp_path):
         plan = toy_plan(tmp_path, 12, 12, seconds=0.1)
