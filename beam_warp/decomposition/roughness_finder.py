@@ -37,17 +37,30 @@ def asked_frames(count: int) -> list[int]:
     return sorted({round(place) for place in np.linspace(0, count - 1, min(count, ROUGHNESS_FRAMES))})
 
 
-def find_roughness(positions: NDArray[np.float32], profiles: Iterable[RoughnessProfile]) -> RoughnessEstimate:
+def find_roughness(
+    positions: NDArray[np.float32], profiles: Iterable[RoughnessProfile], frame_count: int = 1
+) -> RoughnessEstimate:
     """Estimate the roughness of Gaussians from what the views of some frames say, which all have them.
+
+    Where there are more frames, the report's ``frames_left_out`` says how many, and ``change_by_all`` by how much
+    roughness would change if they were asked too (root mean square), judged by what half of the frames leave out.
 
     Args:
         positions: Of the Gaussians in the first of these frames [m], ``(N, 3)``.
         profiles: Of the frames, taken one at a time; none where views say nothing.
+        frame_count: How many frames there are.
     """
-    total: RoughnessProfile | None = None
-    for profile in profiles:
-        total = profile if total is None else total + profile
-    return solve_roughness(positions, total or RoughnessProfile.of_nothing(len(positions)))
+    halves = [RoughnessProfile.of_nothing(len(positions))] * 2
+    for place, profile in enumerate(profiles):
+        halves[place % 2] += profile
+    found = solve_roughness(positions, halves[0] + halves[1])
+    asked = found.report["frames"]
+    if 2 <= asked < frame_count:
+        # Of the variance of one frame, the other half of n frames takes 2 / n - 1 / n, and N frames take 1 / n - 1 / N.
+        changes = [solve_roughness(positions, half).roughness - found.roughness for half in halves]
+        change = float(np.sqrt((1.0 - asked / frame_count) * np.mean(np.square(changes))))
+        found.report.update(frames_left_out=frame_count - asked, change_by_all=change)
+    return found
 
 
 def profiles_of(plan: JobPlan, frames: Iterable[SeenFrame], count: int) -> Iterator[RoughnessProfile]:

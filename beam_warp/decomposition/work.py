@@ -363,7 +363,7 @@ class MaterialWork:
             write_frame(self.stored("roughness"), {})
             return {}
         profiles = filter(None, map(self.archive.profile, self._asked))
-        estimate = find_roughness(self.source.first.cloud.positions, profiles)
+        estimate = find_roughness(self.source.first.cloud.positions, profiles, len(self.frames.numbers()))
         write_frame(self.stored("roughness"), _roughness_arrays(estimate))
         return {"roughness": estimate.report}
 

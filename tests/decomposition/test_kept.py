@@ -42,7 +42,7 @@ def found(tmp_path, monkeypatch):
         turn = [np.nan, np.inf, 0.0, np.nan, np.nan]
         return {"numbers": np.array([*turn, next(lights), 0.0]), "findings": np.frombuffer(b"[]", np.uint8)}
 
-    def find_roughness(positions, profiles):
+    def find_roughness(positions, profiles, frame_count):
         return SimpleNamespace(roughness=np.float32([next(estimates)]), standard_error=np.zeros(1), report={})
 
     monkeypatch.setattr("beam_warp.decomposition.work.find_light", find_light)

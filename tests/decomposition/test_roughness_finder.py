@@ -69,10 +69,10 @@ class _Cloud:
         return COUNT
 
 
-def frames(count, spread):
+def frames(count, spread, true=0.5):
     """Profiles of frames whose errors are independent."""
     rng = np.random.default_rng(1)
-    return [told(0.5 + spread * rng.normal(size=(2, COUNT)), spread) for _ in range(count)]
+    return [told(true + spread * rng.normal(size=(2, COUNT)), spread) for _ in range(count)]
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -84,8 +84,18 @@ def test_all_frames_that_are_asked_count(found, count):
     for profile in profiles[1:]:
         total = total + profile
     whole = solve_roughness(POSITIONS, total)
-    assert np.array_equal(estimate.roughness, whole.roughness)
-    assert np.array_equal(estimate.standard_error, whole.standard_error)
+    np.testing.assert_allclose(estimate.roughness, whole.roughness, rtol=1e-5)
+    np.testing.assert_allclose(estimate.standard_error, whole.standard_error, rtol=1e-5)
+    assert "frames_left_out" not in estimate.report
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.3, 0.6, 1.0])
+def test_what_frames_that_are_not_asked_would_change(spread):
+    profiles = frames(24, spread, 0.2 + 0.6 * POSITIONS[:, 0])
+    some = find_roughness(POSITIONS, profiles[::3], 24)
+    change = find_roughness(POSITIONS, profiles, 24).roughness - some.roughness
+    assert some.report["frames_left_out"] == 16
+    assert 0.5 < some.report["change_by_all"] / np.sqrt(np.square(change).mean()) < 2.0
 
 
 class TestPilot:
