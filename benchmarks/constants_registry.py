@@ -299,6 +299,7 @@ MATERIALS = (
     Constant(ROUGHNESS + "NEAR " + ROUGHNESS + "WIDE", BOTH, "Clusters of a place and of its surroundings."),
     Constant(ROUGHNESS + "PARENTS", JUDGED, "Clusters that a Gaussian is told by."),
     Constant(ROUGHNESS + "SHARED", BOTH, "Part of the agreement of halves that counts.", most=1.0),
+    Constant(ROUGHNESS + "COMPARED", JUDGED, "Gaussians around a place whose halves are compared."),
     Constant(ROUGHNESS + "LEAST_AGREEMENT", JUDGED, "Logarithm of the odds for any claim."),
     Constant(ROUGHNESS + "RoughnessPrior(mean)", JUDGED, "Roughness where nothing is known."),
     Constant(ROUGHNESS + "RoughnessPrior(spread)", JUDGED, "Its spread."),
@@ -544,7 +545,7 @@ UNTUNED = {
         beam_warp.kernels.reconstruction.seen_colors: ROUNDS
         beam_warp.materials.base_color: UNKNOWN
         beam_warp.materials.evidence: RADII
-        beam_warp.materials.roughness: CANDIDATES GRID PRECISIONS STEPS SPREADS
+        beam_warp.materials.roughness: CANDIDATES GRID PRECISIONS STEPS SPREADS PARTS_OF_SCATTER
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
         beam_warp.materials.light_turn: TURNS
@@ -613,7 +614,7 @@ UNTUNED = {
         beam_warp.materials.light_fits: LEAST_VIEWS VIEW_THREADS
         beam_warp.materials.light_turn: SPLIT LEAST_COLOR LEAST_LIGHT FLAT ROUNDS SMALLEST_DIFFERENCE PULL
         beam_warp.materials.residues: LEAST_ALPHA FEWEST_LIGHT_SAMPLES
-        beam_warp.materials.roughness: MOST_ASKED TINY
+        beam_warp.materials.roughness: MOST_ASKED MOST_COMPARED ANGLE_STEP TINY
         beam_warp.materials.roughness_source: MAX_TEXELS
         beam_warp.kernels.materials.bounded_solve: LANES
         beam_warp.kernels.materials.view_evidence: PIXEL_CHANNELS

@@ -120,13 +120,13 @@ class FrameArchive:
         Raises:
             OutputError: The file cannot be written; nothing is left behind.
         """
-        told = {} if profile is None else {"misfit": profile.misfit, "views": profile.views, "tilt": profile.tilt}
+        told = {} if profile is None else {"misfit": profile.misfit, "views": profile.views, "scatter": profile.scatter}
         write_frame(self.profile_path(number), {name: np.asarray(array) for name, array in told.items()})
 
     def profile(self, number: int) -> RoughnessProfile | None:
         """Return what was kept of a frame's roughness."""
         arrays = read_frame(self.profile_path(number))
-        return RoughnessProfile(arrays["misfit"], arrays["views"], tilt=arrays["tilt"]) if arrays else None
+        return RoughnessProfile(arrays["misfit"], arrays["views"], scatter=arrays["scatter"]) if arrays else None
 
     def profile_path(self, number: int) -> Path:
         """Return the file of what views of a frame say of roughness."""

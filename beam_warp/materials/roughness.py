@@ -6,6 +6,9 @@ four parts in a hundred, so a single Gaussian says next to nothing; what its sur
 well one half of the views predicts the other. The outcome is a distribution for every Gaussian, of which mean and
 standard deviation are stated: where the data cannot tell, these are the prior's.
 
+A lobe is seen as wide as it is and as normals scatter where a Gaussian is seen: one of roughness r looks like one of
+(r^4 + a^2)^(1/4) if they scatter by an angle a. So a candidate's misfit is that of what it looks like.
+
 The weights: a misfit A counts as evidence exp(-T A). With halves 1 and 2 of the views, each with a base colour of its
 own, T maximises the sum over places of
 
@@ -16,7 +19,8 @@ other, or fit everything, the maximum is at T = 0 and nothing is claimed. Errors
 normals, above all) are not seen this way: evidence counts `SHARED` of what they agree on.
 
 Sources: Varin et al. 2011 (composite likelihoods claim too much when errors are shared, and are to be scaled);
-Bissiri, Holmes and Walker 2016 (evidence from a misfit, exp(-T A), and the choice of T).
+Bissiri, Holmes and Walker 2016 (evidence from a misfit, exp(-T A), and the choice of T); Olano and Baker 2010, "LEAN
+mapping" (variances of slopes add up; alpha^2, r^4, is that of both directions together).
 """
 
 from __future__ import annotations
@@ -71,6 +75,15 @@ STEPS = np.array((0.0, 0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2,
 SPREADS = np.geomspace(0.05, 0.4, 13)
 """Spreads of the prior that are tried: no subject is of one roughness to better than the split sum knows it."""
 
+ANGLE_STEP = 0.01
+"""Step of the angles of scatter that are told apart [rad]: a lobe of roughness 0.3 looks like one of 0.301 by it."""
+
+PARTS_OF_SCATTER = (0.0, 0.125, 0.25, 0.5, 1.0)
+"""Parts of it that are tried; between them the result is interpolated."""
+
+COMPARED, MOST_COMPARED = 64, 1_000
+"""Gaussians around a place whose halves are compared, few enough for one roughness, and about how many places."""
+
 SHARED = 0.25
 """Part of the agreement of two halves of the views that counts: the rest is taken for errors that they share.
 
@@ -100,13 +113,14 @@ class RoughnessProfile:
             residual, s 0.06 of what a white surface would show with nothing in the way.
         views: Sum of w over all views: how many that see a whole pixel from the front, ``(N,)``; 0 where there is none.
         frames: Number of frames.
-        tilt: Sum over frames of the squared angle that normals are off by, times the views, ``(N,)`` [rad^2].
+        scatter: Sum over frames of the squared angle by which normals scatter where a Gaussian is seen, times its
+            ``views``, ``(N,)`` [rad^2].
     """
 
     misfit: NDArray[np.floating[Any]]
     views: NDArray[np.floating[Any]]
     frames: int = 1
-    tilt: NDArray[np.floating[Any]] | float = 0.0
+    scatter: NDArray[np.floating[Any]] | float = 0.0
 
     def __post_init__(self) -> None:
         """Check shapes once."""
@@ -127,7 +141,7 @@ class RoughnessProfile:
             np.add(self.misfit, other.misfit, dtype=np.float64),
             np.add(self.views, other.views, dtype=np.float64),
             self.frames + other.frames,
-            np.add(self.tilt, other.tilt, dtype=np.float64),
+            np.add(self.scatter, other.scatter, dtype=np.float64),
         )
 
     @classmethod
@@ -137,8 +151,8 @@ class RoughnessProfile:
 
     def of(self, rows: NDArray[np.integer[Any]]) -> RoughnessProfile:
         """Return the profile of some of the Gaussians."""
-        tilt = np.broadcast_to(self.tilt, len(self.views))
-        return RoughnessProfile(self.misfit[:, rows], self.views[rows], self.frames, tilt[rows])
+        scatter = np.broadcast_to(self.scatter, len(self.views))
+        return RoughnessProfile(self.misfit[:, rows], self.views[rows], self.frames, scatter[rows])
 
 
 @dataclass(frozen=True)
@@ -168,14 +182,14 @@ class RoughnessEstimate:
 
     Attributes:
         roughness: Mean of each Gaussian's distribution, perceptual, ``(N,)`` float32.
-        standard_error: Its standard deviation, joined with `MODEL_ERROR` and with how much too rough lobes look under
-            normals that are off, ``(N,)`` float32.
+        standard_error: Its standard deviation, joined with `MODEL_ERROR`, ``(N,)`` float32.
         informed: False where the data adds little to the prior, ``(N,)`` bool.
         prior: What all Gaussians together say, or what was given.
         report: How it came about, JSON-ready: ``informed_part``, ``median_error``, ``frames``; the ``prior_mean`` and
             ``prior_spread`` that a Gaussian without evidence gets; ``step``, by how much places differ from their
-            surroundings; ``near`` and ``wide``, each with the ``precision`` T and the ``agreement`` of halves of the
-            views, a natural logarithm of odds.
+            surroundings; ``scatter_part``, the part of their scatter by which normals make lobes wider; ``near`` and
+            ``wide``, each with the ``precision`` T and the ``agreement`` of halves of the views, a natural logarithm
+            of odds.
     """
 
     roughness: NDArray[np.float32]
@@ -240,8 +254,7 @@ def measure_roughness_profile(
     misfit = np.zeros((int(PARTS), count, len(CANDIDATES)), np.float32)
     counted = np.zeros(count, np.float32)
     misfit[:, told], counted[told] = fit.misfit.numpy(), fit.views.numpy()
-    # The normal is a mean over views, whose errors have little in common.
-    return RoughnessProfile(misfit, counted, tilt=np.minimum(counted, 1.0) * points.normal_error[chosen] ** 2)
+    return RoughnessProfile(misfit, counted, scatter=counted * np.square(points.normal_error[chosen]))
 
 
 def solve_roughness(
@@ -267,23 +280,30 @@ def solve_roughness(
         raise InvalidArrayError(
             f"positions must have shape ({len(profile.views)}, 3), got {places.shape}. Take those of one of the frames."
         )
-    from scipy.interpolate import CubicSpline  # with scipy.optimize; a take starts without them
-
     known = np.flatnonzero(profile.views > 0.0)
     if not len(known):
         chosen = prior or RoughnessPrior()
         moments = _moments(_log_prior(chosen))
         means, errors = (np.full(len(places), value) for value in (moments[0], np.hypot(moments[1], MODEL_ERROR)))
-        report = {"near": _Evidence(0.0, 0.0), "wide": _Evidence(0.0, 0.0), "step": 0.0, "frames": profile.frames}
+        nothing = _Evidence(0.0, 0.0)
+        report = {"near": nothing, "wide": nothing, "step": 0.0, "scatter_part": 0.0, "frames": profile.frames}
         return _estimate(means, errors, np.zeros(len(places), bool), chosen, moments, report)
     seen = places[known]
     tree = cKDTree(seen[_along_curve(seen)][::CLUSTER])
     cluster = tree.query(seen, workers=-1)[1]
-    clusters = _cluster_sums(np.asarray(profile.misfit, np.float64)[:, known], cluster, tree.n)
-    resample = CubicSpline(CANDIDATES, np.eye(len(CANDIDATES)))(GRID).T
-    near, wide = (_sums_around(tree, clusters, count) @ resample for count in (NEAR, WIDE))
+    scatter = np.broadcast_to(profile.scatter, len(places))[known] / profile.views[known]
+    misfit = np.asarray(profile.misfit, np.float64)[:, known]
+
+    def pooled(part: float, *counts: int) -> list[NDArray[np.float64]]:
+        clusters = _cluster_sums(as_seen(misfit, part * scatter), cluster, tree.n)
+        return [_sums_around(tree, clusters, count) for count in counts]
+
     asked = slice(None, None, -(-tree.n // MOST_ASKED))
     counted = tree.n / len(range(tree.n)[asked])  # how many places each one that is asked stands for
+    (looks,) = pooled(0.0, NEAR)
+    worth = _worth(_log_prior(prior or RoughnessPrior()), looks[:, asked], counted / NEAR)
+    part = part_of_scatter(seen, misfit[0], scatter, worth.precision)
+    near, wide = pooled(part, NEAR, WIDE)
     chosen, near_evidence, wide_evidence = _weigh(near[:, asked], wide[:, asked], counted, prior)
     outside = _normalized(_log_prior(chosen) - wide_evidence.precision * (wide[0] - near[0]))
     inside = -near_evidence.precision * near[0]
@@ -291,14 +311,17 @@ def solve_roughness(
     distribution = _normalized(_widened(outside, step) + inside)
     mean, spread = _moments(distribution)
     moments = _moments(_widened(_log_prior(chosen), step))
-    tilts = np.stack([np.broadcast_to(profile.tilt, len(places)), profile.views])[:, known, None].astype(np.float64)
-    tilt, views = _sums_around(tree, _cluster_sums(tilts, cluster, tree.n), NEAR)[..., 0]
-    wide_by = mean - narrowed(mean, tilt / views)
     weight, index = _nearest(tree, places)
     roughness = (weight * mean[index]).sum(axis=1)
-    error = np.sqrt((weight * (np.square(spread) + np.square(wide_by))[index]).sum(axis=1) + MODEL_ERROR**2)
+    error = np.sqrt((weight * np.square(spread)[index]).sum(axis=1) + MODEL_ERROR**2)
     informed = (weight * spread[index]).sum(axis=1) < INFORMED_PART * moments[1]
-    report = {"near": near_evidence, "wide": wide_evidence, "step": step, "frames": profile.frames}
+    report = {
+        "near": near_evidence,
+        "wide": wide_evidence,
+        "step": step,
+        "scatter_part": part,
+        "frames": profile.frames,
+    }
     return _estimate(roughness, error, informed, chosen, moments, report)
 
 
@@ -308,18 +331,59 @@ def evenly_spread(positions: NDArray[np.floating[Any]], count: int) -> NDArray[n
     return np.sort(order[:: max(len(order) // count, 1)])
 
 
-def narrowed(roughness: NDArray[np.floating[Any]], tilt: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Return the roughness of lobes that look so rough because normals are off; no less than the smoothest candidate.
-
-    Mirrored at normals that scatter by an angle a, a lobe of alpha = r^2 is seen as one of alpha^2 + a^2.
+def as_seen(misfit: NDArray[np.float64], scatter: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Return misfits of roughnesses on `GRID`, each that of what it looks like at normals that scatter.
 
     Args:
-        roughness: Perceptual, as it looks.
-        tilt: Mean of a^2 over both directions together [rad^2].
-
-    Source: Olano and Baker 2010, "LEAN mapping": variances of slopes add up; alpha^2 is twice that of one direction.
+        misfit: Of what is seen, at `CANDIDATES`, ``(P, N, 12)``.
+        scatter: Mean square of the angle, in both directions together [rad^2], ``(N,)``.
     """
-    return np.maximum(roughness**4 - tilt, CANDIDATES[0] ** 4) ** 0.25
+    from scipy.interpolate import CubicSpline  # with scipy.optimize; a take starts without them
+
+    spline = CubicSpline(CANDIDATES, np.eye(len(CANDIDATES)))
+    level = np.rint(np.sqrt(scatter) / ANGLE_STEP)
+    found = np.empty((*misfit.shape[:2], len(GRID)))
+    for step in np.unique(level):
+        looks = (GRID**4 + (step * ANGLE_STEP) ** 2) ** 0.25
+        found[:, level == step] = misfit[:, level == step] @ spline(np.minimum(looks, GRID[-1])).T
+    return found
+
+
+def part_of_scatter(
+    places: NDArray[np.float64], misfit: NDArray[np.float64], scatter: NDArray[np.floating[Any]], precision: float
+) -> float:
+    """Return the part of their scatter by which normals make lobes wider, in [0, 1].
+
+    The rest is noise of what pixels show of the normals, which mirrors nothing. Around a place roughness is the same,
+    however much normals scatter. So the half of its surroundings whose normals scatter more must not look rougher than
+    the other one: the part is the least at which a difference of roughness between both makes no data more probable,
+    by the derivative of all places' evidence.
+
+    Args:
+        places: Positions of Gaussians [m], ``(N, 3)``.
+        misfit: Of all their views, at `CANDIDATES`, ``(N, 12)``.
+        scatter: As for `as_seen`.
+        precision: What misfits are worth; if 0, so is the part.
+    """
+    count = min(COMPARED, len(places)) // 2
+    if not (precision > 0.0 and count and scatter.any()):
+        return 0.0
+    near = cKDTree(places).query(places[evenly_spread(places, MOST_COMPARED)], k=2 * count, workers=-1)[1]
+    near = np.take_along_axis(near, np.argsort(scatter[near], axis=1, kind="stable"), axis=1)
+    before = (0.0, 0.0)
+
+    def pull(part: float) -> float:
+        seen = as_seen(misfit[None, near.ravel()], part * scatter[near.ravel()])[0]
+        less, more = seen.reshape(len(near), 2, count, -1).sum(axis=2).transpose(1, 0, 2)
+        chance = np.exp(_normalized(-precision * (less + more)))
+        return float((chance * np.gradient(less - more, GRID, axis=1)).sum())
+
+    for part in PARTS_OF_SCATTER:
+        found = pull(part)
+        if not found > 0.0:
+            return before[0] + (part - before[0]) * before[1] / (before[1] - found) if part else 0.0
+        before = part, found
+    return before[0]
 
 
 class _Evidence(NamedTuple):

@@ -23,12 +23,13 @@ from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import Neighborhoods, SurfacePoints
 from beam_warp.materials.roughness import (
     CANDIDATES,
+    GRID,
     MODEL_ERROR,
     SHARED,
     RoughnessPrior,
     RoughnessProfile,
+    as_seen,
     measure_roughness_profile,
-    narrowed,
     solve_roughness,
 )
 from beam_warp.world.environment import EnvironmentMap, texel_directions
@@ -124,7 +125,8 @@ def test_a_mean_of_tilted_lobes_is_a_wider_one(roughness, angle):
     apart = [(np.sin(polar) * (mean - lobe(np.cos(polar), r**2)) ** 2).sum() for r in tries]
     looks = (roughness**4 + angle**2) ** 0.25
     assert tries[np.argmin(apart)] == pytest.approx(looks, abs=0.02)  # a mean of GGX lobes is nearly one
-    assert narrowed(np.array(looks), np.array(angle**2)) == pytest.approx(roughness)
+    misfit = np.square(np.array(CANDIDATES) - looks)[None, None]
+    assert GRID[np.argmin(as_seen(misfit, np.array([angle**2])))] == pytest.approx(roughness, abs=0.02)
 
 
 class TestKnownSpheres:
@@ -136,15 +138,24 @@ class TestKnownSpheres:
         assert np.median(found.standard_error) < 0.1  # the prior's, before any data, is 0.21
         assert abs(found.report["prior_mean"] - truth) < 0.1
 
-    def test_normals_that_are_off_make_lobes_look_rough_and_errors_say_so(self, device):
-        """Tilts so large that faces take up only a part of them."""
-        positions, profile = profile_of(SKY, 0.35, device, tilt=0.4)
+    def test_normals_that_scatter_make_lobes_look_rough_and_that_is_taken_back(self, device):
+        angles = np.random.default_rng(2).uniform(0.05, 0.5, 800)
+        positions, profile = profile_of(SKY, (0.35**4 + angles**2) ** 0.25, device)
         silent = solve_roughness(positions, profile)
-        found = solve_roughness(positions, replace(profile, tilt=0.4**2 * profile.views))
-        assert np.array_equal(found.roughness, silent.roughness)
-        assert np.median(found.roughness) > 0.4
-        assert within(silent, 0.35, 2.0) < 0.9
+        found = solve_roughness(positions, replace(profile, scatter=angles**2 * profile.views))
+        assert np.median(silent.roughness) > 0.5
+        assert within(silent, 0.35, 2.0) < 0.1
+        assert found.report["scatter_part"] > 0.7
         assert within(found, 0.35, 2.0) > 0.95
+
+    def test_normals_that_scatter_in_pixels_only_change_nothing(self, device):
+        """Lobes do not look wider where normals scatter more: what scatters is noise."""
+        angles = np.random.default_rng(2).uniform(0.05, 0.5, 800)
+        positions, profile = profile_of(SKY, 0.35, device)
+        silent = solve_roughness(positions, profile)
+        found = solve_roughness(positions, replace(profile, scatter=angles**2 * profile.views))
+        assert found.report["scatter_part"] < 0.1
+        assert np.abs(found.roughness - silent.roughness).max() < 0.03
 
     def test_normals_that_are_off_one_by_one_hardly_matter(self, device):
         """Faces are what neighbours agree on; one by one, such normals would make it look like 0.52."""
