@@ -370,6 +370,7 @@ MATERIALS = (
         for name, does in (
             ("LEVELS", "Levels of roughness whose highlights explain those of all others."),
             ("NEIGHBORS", "Gaussians over which normals are averaged."),
+            ("SMOOTHEST", "Part of the points that is compared, where normals agree most."),
             ("DARKEST", "Colour of points that are left out, of the median."),
             ("LEAST_CHANCE", "Least probability of a roughness."),
             ("LEAST_SPREAD", "Least standard deviation of a colour."),

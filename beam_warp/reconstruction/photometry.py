@@ -12,7 +12,7 @@ material of one roughness that nothing hides has a weight w of 1 for it and 0 fo
 normal with the mean and covariance of such a choice, whose probabilities all points share: what is left to 1 is hidden.
 All begin alike, and are then the mean of the points' weights. Gains are those of least squares with all points'
 unknowns eliminated. Each point has a deviation of its own, so that fine texture, and places where the surface is wrong,
-count little.
+count little. Points are those whose neighbours' normals agree most.
 
 How sure the gains are is asked twice. The bright and the dark half of the points must tell the same, for gloss is a
 larger part of what a dark point shows: half of their difference is as large as the error. Of what the model of gloss
@@ -75,6 +75,10 @@ runner and robot, whose cameras are pinholes, seems to be 0.02, -0.12 and -0.14.
 
 FIRST_POINTS, MOST_POINTS = 1_024, 4_096
 """Most points that are compared, evenly chosen: at first, and where these say that something may be wrong."""
+
+SMOOTHEST = 0.25
+"""Part of the points that may be compared, those whose neighbours' normals agree most: where they do not, the surface
+is wrong, and so is the gloss that is expected of it."""
 
 FEWEST_POINTS = 64
 """Fewest points that tell gains."""
@@ -171,9 +175,9 @@ def find_exposures(
     Raises:
         DeviceError: There is no such device.
     """
-    normals = _smoothed(cloud.positions, normals)
+    normals, agreement = smoothed(cloud.positions, normals)
     samples = view_samples(views, cloud, normals, device=device).numpy()
-    rows = np.flatnonzero(((samples[..., 3] > 0.0).sum(axis=0) >= LEAST_VIEWS) & normals.any(axis=1))
+    rows = smoothest(np.where((samples[..., 3] > 0.0).sum(axis=0) >= LEAST_VIEWS, agreement, 0.0))
     solved = None
     for most in (FIRST_POINTS, MOST_POINTS):
         chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), 2 * most)).astype(int)]
@@ -191,12 +195,21 @@ def find_exposures(
     return None if solved is None else judged(names, solved)
 
 
-def _smoothed(positions: NDArray[np.floating], normals: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the mean direction of the nearest normals, 0 where there is none."""
+def smoothed(
+    positions: NDArray[np.floating], normals: NDArray[np.floating]
+) -> tuple[NDArray[np.float32], NDArray[np.floating]]:
+    """Return the mean direction of the nearest normals, and how far they agree, in [0, 1]; 0 where there is none."""
     near = cKDTree(positions).query(positions, k=min(NEIGHBORS, len(positions)), workers=-1)[1]
-    mean = normals[near.reshape(len(positions), -1)].sum(axis=1)
-    length = np.linalg.norm(mean, axis=1, keepdims=True)
-    return np.divide(mean, length, out=np.zeros_like(mean), where=length > 0.0)
+    mean = normals[near.reshape(len(positions), -1)].mean(axis=1)
+    length = np.linalg.norm(mean, axis=1)
+    return np.divide(mean, length[:, None], out=np.zeros_like(mean), where=length[:, None] > 0.0), length
+
+
+def smoothest(agreement: NDArray[np.floating]) -> NDArray[np.intp]:
+    """Return the rows of points that are compared: of those with any agreement the part that has most; ascending."""
+    rows = np.flatnonzero(agreement > 0.0)
+    count = max(round(SMOOTHEST * len(rows)), 2 * FIRST_POINTS)
+    return np.sort(rows[np.argsort(-agreement[rows], kind="stable")[:count]])
 
 
 def highlights(

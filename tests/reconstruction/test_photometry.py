@@ -19,6 +19,8 @@ from beam_warp.reconstruction.photometry import (
     highlights,
     judged,
     may_compare,
+    smoothed,
+    smoothest,
     solve_gains,
 )
 from beam_warp.world.environment import EnvironmentMap
@@ -118,6 +120,24 @@ def test_each_is_judged_by_its_own_evidence(lit, rng):
     assert (found.exposure_undone, found.balance_undone) == (True, False)
     for camera in found.cameras:
         np.testing.assert_allclose(camera.gains, camera.gains[0], rtol=1e-12)
+
+
+def test_points_are_compared_where_the_surface_is_told(rng):
+    """The upper half of a ball has normals that scatter, its lowest part none."""
+    true = rng.normal(size=(20_000, 3))
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    is_rough = true[:, 2] > 0.0
+    normals = true + np.where(is_rough, 0.5, 0.02)[:, None] * rng.normal(size=true.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[true[:, 2] < -0.9] = 0.0
+    mean, agreement = smoothed(true, normals)
+    agreement[::7] = 0.0
+    rows = smoothest(agreement)
+    assert len(rows) == round(0.25 * (agreement > 0.0).sum())
+    assert is_rough[rows].mean() < 0.01
+    assert true[rows, 2].min() > -0.95
+    assert np.degrees(np.arccos((mean[rows] * true[rows]).sum(axis=1))).max() < 4.0
+    assert len(smoothest(agreement[:1500])) == (agreement[:1500] > 0.0).sum()
 
 
 def test_more_points_tell_gains_better(lit, rng):
