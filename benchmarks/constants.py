@@ -52,7 +52,8 @@ from beam_warp.materials.direct import measure_materials
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.materials.roughness import measure_roughness_profile, solve_roughness
+from beam_warp.materials.roughness import solve_roughness
+from beam_warp.materials.roughness_profile import measure_roughness_profile
 from beam_warp.mesh.distances import surface_distances
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.reconstruction.drift import tracking_drift

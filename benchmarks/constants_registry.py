@@ -546,7 +546,8 @@ UNTUNED = {
         beam_warp.kernels.reconstruction.seen_colors: ROUNDS
         beam_warp.materials.base_color: UNKNOWN
         beam_warp.materials.evidence: RADII
-        beam_warp.materials.roughness: CANDIDATES GRID PRECISIONS STEPS SPREADS PARTS_OF_SCATTER
+        beam_warp.materials.roughness: GRID PRECISIONS STEPS SPREADS PARTS_OF_SCATTER
+        beam_warp.materials.roughness_profile: CANDIDATES
         beam_warp.materials.exposure: EXPOSURE_FACTORS
         beam_warp.materials.light: FEW_VALUES EIGHT_BIT CUT_PART STEP_SLACK DARKEST
         beam_warp.materials.light_turn: TURNS

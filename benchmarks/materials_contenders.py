@@ -24,7 +24,8 @@ from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.images import ImagePathOptions, decompose_by_images
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.materials.roughness import measure_roughness_profile, solve_roughness
+from beam_warp.materials.roughness import solve_roughness
+from beam_warp.materials.roughness_profile import measure_roughness_profile
 from beam_warp.raster.records import RasterOptions
 from beam_warp.study.materials import without_color
 from beam_warp.trace.scene import Scene

@@ -32,7 +32,8 @@ from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import SurfacePoints
-from beam_warp.materials.roughness import RoughnessEstimate, measure_roughness_profile, solve_roughness
+from beam_warp.materials.roughness import RoughnessEstimate, solve_roughness
+from beam_warp.materials.roughness_profile import measure_roughness_profile
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.job import ReconstructOptions, reconstruct

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beam_warp.jobs.store import is_stored_frame, read_frame, write_frame
 from beam_warp.materials.base_color import BaseColor
 from beam_warp.materials.direct import ColorEvidence
-from beam_warp.materials.roughness import RoughnessProfile
+from beam_warp.materials.roughness_profile import RoughnessProfile
 from beam_warp.world.gaussians import ATTRIBUTES, WORLD_AXES, GaussianCloud
 
 _STORED = re.compile(r"(?:frame|solution|profile)_(\d{6,})\.h5")

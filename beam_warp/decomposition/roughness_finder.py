@@ -13,14 +13,8 @@ from numpy.typing import NDArray
 
 from beam_warp.decomposition.plan import JobPlan
 from beam_warp.decomposition.seen import SeenFrame
-from beam_warp.materials.roughness import (
-    LEAST_AGREEMENT,
-    RoughnessEstimate,
-    RoughnessProfile,
-    evenly_spread,
-    measure_roughness_profile,
-    solve_roughness,
-)
+from beam_warp.materials.roughness import LEAST_AGREEMENT, RoughnessEstimate, evenly_spread, solve_roughness
+from beam_warp.materials.roughness_profile import RoughnessProfile, measure_roughness_profile
 
 ROUGHNESS_FRAMES = 8
 """Most frames of persistent Gaussians that roughness is found from: more add little that is new."""

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from beam_warp.decomposition import roughness_finder
 from beam_warp.decomposition.roughness_finder import ROUGHNESS_FRAMES, asked_frames, find_roughness, profiles_of
-from beam_warp.materials.roughness import CANDIDATES, RoughnessProfile, evenly_spread, solve_roughness
+from beam_warp.materials.roughness import evenly_spread, solve_roughness
+from beam_warp.materials.roughness_profile import CANDIDATES, RoughnessProfile
 
 COUNT = 2000
 POSITIONS = np.random.default_rng(0).uniform(size=(COUNT, 3)).astype(np.float32)

@@ -21,17 +21,8 @@ from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.materials.normals import Neighborhoods, SurfacePoints
-from beam_warp.materials.roughness import (
-    CANDIDATES,
-    GRID,
-    MODEL_ERROR,
-    SHARED,
-    RoughnessPrior,
-    RoughnessProfile,
-    as_seen,
-    measure_roughness_profile,
-    solve_roughness,
-)
+from beam_warp.materials.roughness import GRID, MODEL_ERROR, SHARED, RoughnessPrior, as_seen, solve_roughness
+from beam_warp.materials.roughness_profile import CANDIDATES, RoughnessProfile, measure_roughness_profile
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 
 NOISE = 0.01

@@ -299,7 +299,7 @@ class TestProcesses:
 
     @pytest.mark.skipif(sys.platform == "win32", reason="processes are not forked")
     def test_a_server_that_refuses_while_it_is_taken_down(self, tmp_path, whole, monkeypatch):
-        """For a while the killed server counts as running, so that no other one is started."""
+        """The killed server counts as running for a while, so that no other one is started."""
         connect, end = forkserver.connect_to_new_process, time.monotonic() + 0.3
 
         def late(fds):
