@@ -147,7 +147,8 @@ class SurfacePoints:
         normals: Unit, outward, ``(N,)`` vec3; where not ``seen`` they may be 0.
         offsets: How far ray origins are lifted along the normals [m], ``(N,)`` float.
         seen: Points worth measuring; what hardly any view shows is filled from neighbours, ``(N,)`` bool.
-        normal_error: By how much normals may be off [rad], ``(N,)`` float32; 0 where it is not known.
+        normal_error: By how much normals scatter in the pixels that show a Gaussian, and so may be off [rad], ``(N,)``
+            float32; 0 where it is not known.
         confidence: Of the normals, in [0, 1], ``(N,)`` float32.
         tracing: What is in the way of rays from these points.
         around: What lies around the points that views show; None without views.

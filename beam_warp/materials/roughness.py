@@ -247,7 +247,6 @@ def part_of_scatter(
         return 0.0
     near = cKDTree(places).query(places[evenly_spread(places, MOST_COMPARED)], k=2 * count, workers=-1)[1]
     near = np.take_along_axis(near, np.argsort(scatter[near], axis=1, kind="stable"), axis=1)
-    before = (0.0, 0.0)
 
     def pull(part: float) -> float:
         seen = as_seen(misfit[None, near.ravel()], part * scatter[near.ravel()])[0]
@@ -255,12 +254,13 @@ def part_of_scatter(
         chance = np.exp(_normalized(-precision * (less + more)))
         return float((chance * np.gradient(less - more, GRID, axis=1)).sum())
 
+    last, above = 0.0, 0.0
     for part in PARTS_OF_SCATTER:
         found = pull(part)
         if not found > 0.0:
-            return before[0] + (part - before[0]) * before[1] / (before[1] - found) if part else 0.0
-        before = part, found
-    return before[0]
+            return float(np.interp(0.0, (found, above), (part, last)))
+        last, above = part, found
+    return last
 
 
 class _Evidence(NamedTuple):
