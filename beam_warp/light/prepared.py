@@ -93,7 +93,7 @@ class PreparedEnvironment:
         return float(np.pi * self._fitted[0].mean_radiance().mean())
 
     def regions(self, count: int) -> EnvironmentRegions:
-        """Return so many regions of equal power, a power of two; see `EnvironmentRegions.of`."""
+        """Return so many regions; see `EnvironmentRegions.of`."""
         if count not in self._regions:
             self._regions[count] = EnvironmentRegions.of(self.environment, count)
         return self._regions[count]

@@ -1,6 +1,7 @@
-"""An environment cut into regions of equal power: few directions that stand for it where shadows are cast.
+"""An environment cut into regions of little spread: few directions that stand for it where shadows are cast.
 
-Source: Debevec 2005, A Median Cut Algorithm for Light Probe Sampling.
+Source: Viriyothai and Debevec 2009, Variance Minimization Light Probe Sampling. A cut for equal power (Debevec 2005)
+spends most regions on a sun, all of which see the same.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.checks import require_count
-from beam_warp.errors import InvalidOptionError
 from beam_warp.image.color import LUMINANCE
 from beam_warp.world.environment import EnvironmentMap
+
+Box = tuple[slice, slice]
+"""Rows and columns of a map."""
 
 LARGEST_HEIGHT = 256
 """Taller maps are reduced to this height, energy kept, before they are cut: a texel is then 0.7 degrees."""
@@ -45,20 +48,16 @@ class EnvironmentRegions:
 
     @classmethod
     def of(cls, environment: EnvironmentMap, count: int) -> EnvironmentRegions:
-        """Cut an environment.
+        """Cut an environment where the variance of its directions, weighted by power, falls most, one cut at a time.
 
         Args:
             environment: The light; a black one is cut evenly.
-            count: K, a power of two, at most `MOST_REGIONS`.
+            count: K, at most `MOST_REGIONS`.
 
         Raises:
-            InvalidOptionError: The count is none of them.
+            InvalidOptionError: The count is out of range.
         """
         require_count("count", count, 1, MOST_REGIONS)
-        if count & (count - 1):
-            raise InvalidOptionError(
-                f"count must be a power of two, got {count}. Choose {2 ** (count.bit_length() - 1)}."
-            )
         height = min(environment.height, LARGEST_HEIGHT)
         source = environment if height == environment.height else environment.resized(height, 2 * height)
         angles = source.solid_angles()
@@ -67,7 +66,7 @@ class EnvironmentRegions:
             power = np.array(angles)
         directions = source.directions()
         flux = source.radiance.astype(np.float64) * angles[..., None]
-        rows = [_summed(*(part[box] for part in (directions, power, flux))) for box in _cut(power, count)]
+        rows = [_summed(*(part[box] for part in (directions, power, flux))) for box in _cut(power, directions, count)]
         middles, halves, moments = zip(*rows, strict=True)
         return cls(np.array(middles), np.array(halves), np.array(moments).transpose(1, 0, 2))
 
@@ -80,32 +79,52 @@ class EnvironmentRegions:
         return EnvironmentRegions(self.directions @ turn.T, self.half_angles, moments)
 
 
-def _cut(power: NDArray[np.float64], count: int) -> list[tuple[slice, slice]]:
-    """Halve the map's power again and again, each time across its longer side on the sphere."""
-    height, width = power.shape
-    boxes = [(slice(0, height), slice(0, width))]
+def _cut(power: NDArray[np.float64], directions: NDArray[np.float64], count: int) -> list[Box]:
+    """Cut a map into boxes; the cut that takes most of the variance away is made first."""
+    light = power[..., None] * np.concatenate([np.ones_like(directions[..., :1]), directions], axis=2)
+    boxes = [(slice(0, power.shape[0]), slice(0, power.shape[1]))]
+    cuts = [_best_cut(light, boxes[0])]
     while len(boxes) < count:
-        boxes = [half for box in boxes for half in _halves(power, box)]
+        most = int(np.argmax([gain for gain, _ in cuts]))
+        _, halves = cuts[most]
+        boxes[most : most + 1] = halves
+        cuts[most : most + 1] = [_best_cut(light, half) for half in halves]
     return boxes
 
 
-def _halves(power: NDArray[np.float64], box: tuple[slice, slice]) -> list[tuple[slice, slice]]:
-    """Cut a box where half of its power is on either side; one of a single texel stays, beside an empty one."""
+def _best_cut(light: NDArray[np.float64], box: Box) -> tuple[float, tuple[Box, Box]]:
+    """Return what the best cut of a box takes off its variance, and its halves.
+
+    A box of a single texel is not cut: it stays, beside an empty one, at a gain below all others.
+
+    Args:
+        light: Power of every texel, and its direction times that, ``(R, C, 4)``.
+        box: Rows and columns.
+    """
     rows, columns = box
-    middle = np.pi * 0.5 * (rows.start + rows.stop) / len(power)
-    tall, wide = rows.stop - rows.start, columns.stop - columns.start
-    across = wide * np.sin(middle) > tall
-    if (wide if across else tall) < 2:
-        across = wide > tall
-    sums = np.cumsum(power[box].sum(axis=0 if across else 1))
-    if len(sums) < 2:
-        return [box, (slice(rows.stop, rows.stop), columns)]
-    place = int(np.argmin(np.abs(sums[:-1] - 0.5 * sums[-1]))) + 1
-    if across:
-        cut = columns.start + place
-        return [(rows, slice(columns.start, cut)), (rows, slice(cut, columns.stop))]
-    cut = rows.start + place
-    return [(slice(rows.start, cut), columns), (slice(cut, rows.stop), columns)]
+    best, halves = -1.0, (box, (slice(rows.stop, rows.stop), columns))
+    whole = _variance(light[box].sum(axis=(0, 1)))
+    for axis in range(2):
+        sums = np.cumsum(light[box].sum(axis=1 - axis), axis=0)
+        if len(sums) < 2:
+            continue
+        gains = whole - _variance(sums[:-1]) - _variance(sums[-1] - sums[:-1])
+        place = int(np.argmax(gains))
+        if gains[place] > best:
+            best, at = float(gains[place]), box[axis].start + place + 1
+            sides = slice(box[axis].start, at), slice(at, box[axis].stop)
+            first, second = ((side, columns) if axis == 0 else (rows, side) for side in sides)
+            halves = first, second
+    return best, halves
+
+
+def _variance(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum over unit directions of power times squared distance from the mean one, ``(...)``.
+
+    Args:
+        sums: Of powers, and of directions times power, ``(..., 4)``.
+    """
+    return sums[..., 0] - np.square(sums[..., 1:]).sum(axis=-1) / np.maximum(sums[..., 0], 1e-300)
 
 
 def _summed(

@@ -1,6 +1,6 @@
 """Light that reaches Gaussians in deferred shading: shadow maps of lights and of an environment's regions, and bounces.
 
-The environment is cut into regions of equal power (`beam_warp.light.regions`), each with a shadow map. A
+The environment is cut into regions (`beam_warp.light.regions`), each with a shadow map. A
 Gaussian gets the irradiance in closed form times the share that the regions' shadows leave, and what surfaces around it
 send (``kernels/render/cluster_bounces.py``). Both are blended into pixels like a material.
 """

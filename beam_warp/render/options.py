@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from beam_warp.checks import require_choice, require_count
-from beam_warp.errors import InvalidOptionError
 from beam_warp.light.regions import MOST_REGIONS
 
 LAYERS = ("base_color", "roughness", "ambient_occlusion", "normals", "depth")
@@ -17,8 +16,8 @@ class DeferredOptions:
     """How shots are shaded.
 
     Attributes:
-        environment_shadows: Directions that stand for the environment where shadows are cast, a power of two; 0 takes
-            ambient occlusion instead.
+        environment_shadows: Directions that stand for the environment where shadows are cast; 0 takes ambient
+            occlusion instead.
         bounces: How often light goes from surface to surface of the Gaussians; 0 for none.
         light_map_size: Side of every light's shadow maps [texel].
         environment_map_size: Side of the environment's shadow maps [texel].
@@ -38,11 +37,7 @@ class DeferredOptions:
 
     def __post_init__(self) -> None:
         """Check every option once."""
-        count = require_count("environment_shadows", self.environment_shadows, 0, MOST_REGIONS)
-        if count & (count - 1):
-            raise InvalidOptionError(
-                f"environment_shadows must be 0 or a power of two, got {count}. Choose {2 ** (count.bit_length() - 1)}."
-            )
+        require_count("environment_shadows", self.environment_shadows, 0, MOST_REGIONS)
         require_count("bounces", self.bounces, 0, 16)
         require_count("light_map_size", self.light_map_size, 16, 8192)
         require_count("environment_map_size", self.environment_map_size, 16, 4096)

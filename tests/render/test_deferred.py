@@ -495,7 +495,7 @@ def test_layers_are_those_of_rasterize(device, figure):
 
 
 def test_options_are_checked():
-    for bad in ({"environment_shadows": 3}, {"bounces": -1}, {"samples": 0}, {"layers": ("colour",)}):
+    for bad in ({"environment_shadows": 257}, {"bounces": -1}, {"samples": 0}, {"layers": ("colour",)}):
         with pytest.raises(InvalidOptionError, match=next(iter(bad))):
             DeferredOptions(**bad)
 
