@@ -577,7 +577,7 @@ export class Relight extends EventTarget {
   shade(camera) {
     if (this.#isLost || this.#isDisposed || !this.#take) return false;
     const regions = this.environmentShadows;
-    require(regions === 0 || (Number.isInteger(Math.log2(regions)) && regions <= passes.REGIONS), `environmentShadows must be 0, or a power of two up to ${passes.REGIONS}`, regions);
+    require(Number.isInteger(regions) && regions >= 0 && regions <= passes.REGIONS, `environmentShadows must be an integer in [0, ${passes.REGIONS}]`, regions);
     const view = viewOf(camera), name = camera.name ?? "main", {width, height} = view;
     this.#advance();
     if (!this.#views.has(name)) this.#views.set(name, {});

@@ -124,7 +124,7 @@ def are_maps_of(rows, views):
         np.testing.assert_allclose(found, wanted, rtol=2e-5, atol=2e-5)
 
 
-@pytest.mark.parametrize(("count", "most"), [(16, 256), (4, 8)])
+@pytest.mark.parametrize(("count", "most"), [(16, 256), (5, 256), (4, 8)])
 def test_regions_of_environments_and_their_maps_are_those_of_the_renderer(adapter, count, most):
     """A map is black below, or has more rows than are cut."""
     radiance = np.random.default_rng(3).gamma(0.2, size=(16, 32, 3)).astype(np.float32)

@@ -18,6 +18,7 @@ const jobs = {
     const handle = prefilterWorker(), {albedo} = handle({}), {maps} = handle({map: {height, radiance: floats(radiance)}, most: 1024});
     return {maps: maps.map((map) => ({height: map.height, radiance: Array.from(map.radiance)})), albedo: Array.from(albedo)};
   },
+  regions: ({height, radiance, count}) => prefilterWorker()({map: {height, radiance: floats(radiance)}, regions: count}),
   /** Ask for what a worker makes, which fails the first time it is asked; says how each request ended, and how often it was asked. */
   retry: async () => {
     let count = 0;

@@ -20,6 +20,7 @@ from beam_warp._version import __version__
 from beam_warp.converters import WriteOptions, write
 from beam_warp.light.ggx import specular_albedo_table
 from beam_warp.light.prefiltered import blurred_environment
+from beam_warp.light.regions import EnvironmentRegions
 from beam_warp.light.uploaded import ROWS
 from beam_warp.render.shadow_maps import LARGEST_KERNEL, ShadowCasters, light_views
 from beam_warp.world.environment import EnvironmentMap
@@ -107,6 +108,20 @@ def test_light_is_read_and_blurred_as_python_does(tmp_path):
     texels = truth.texels.numpy()
     assert np.abs(found - texels).max() < 1e-4 * texels.max()
     assert np.abs(np.reshape(blurred["albedo"], (64, 64, 2)) - specular_albedo_table()).max() < 1e-6
+
+
+@needs_node
+@pytest.mark.parametrize("count", [5, 16])
+def test_regions_of_environments_are_those_of_the_renderer(count):
+    """The map is black below."""
+    radiance = np.random.default_rng(3).gamma(0.2, size=(16, 32, 3)).astype(np.float32)
+    radiance[10:] = 0.0
+    wanted = EnvironmentRegions.of(EnvironmentMap(radiance), count)
+    (found,) = run({"job": "regions", "height": 16, "radiance": radiance.ravel().tolist(), "count": count})
+    directions, halves, moments = zip(*(each.values() for each in found["regions"]), strict=True)
+    np.testing.assert_allclose(directions, wanted.directions, atol=1e-6)
+    np.testing.assert_allclose(halves, wanted.half_angles, atol=1e-5)
+    np.testing.assert_allclose(np.transpose(moments, (1, 0, 2)), wanted.moments, rtol=1e-5, atol=1e-5)
 
 
 @needs_node

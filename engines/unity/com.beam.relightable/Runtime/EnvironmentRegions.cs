@@ -3,7 +3,7 @@ using System.Collections.Generic;
 using UnityEngine;
 
 namespace Beam.Relightable {
-    /// <summary>Regions of an environment of equal power, in the renderer's world; each casts shadows from where its power is.</summary>
+    /// <summary>Regions of an environment of little spread, in the renderer's world; each casts shadows from where its power is.</summary>
     /// <remarks>They are those of beam_warp/light/regions.py.</remarks>
     public sealed class EnvironmentRegions {
         private const double Widest = 75.0 * Math.PI / 180.0;
@@ -17,17 +17,19 @@ namespace Beam.Relightable {
         /// <summary>Three rows each, of red, green and blue: radiance times direction, summed, and how wide it spreads.</summary>
         public readonly List<Vector4> Moments = new List<Vector4>();
 
-        /// <summary>Cut a lat-long map, its top row first, into a number of regions, or the next power of two.</summary>
+        /// <summary>Cut a lat-long map, its top row first, into a number of regions.</summary>
         public static EnvironmentRegions Cut(Vector4[] texels, int rows, int count, int mostRows = 256) {
             var map = new Map(texels, rows, Math.Min(rows, mostRows));
-            var boxes = new List<Box> { new Box(0, map.Rows, 0, 2 * map.Rows) };
-            while (boxes.Count < count) {
-                var halves = new List<Box>();
-                foreach (Box box in boxes) halves.AddRange(map.Halves(box));
-                boxes = halves;
+            var cuts = new List<Cutting> { map.BestCut(new Box(0, map.Rows, 0, 2 * map.Rows)) };
+            while (cuts.Count < count) {
+                int most = 0;
+                for (int k = 1; k < cuts.Count; k++) if (cuts[k].Gain > cuts[most].Gain) most = k;
+                Cutting cut = cuts[most];
+                cuts[most] = map.BestCut(cut.First);
+                cuts.Insert(most + 1, map.BestCut(cut.Second));
             }
             var found = new EnvironmentRegions();
-            foreach (Box box in boxes) map.Sum(box, found);
+            foreach (Cutting cut in cuts) map.Sum(cut.Box, found);
             return found;
         }
 
@@ -52,15 +54,22 @@ namespace Beam.Relightable {
             }
         }
 
+        /// <summary>A box, its halves, and what cutting it takes off its variance.</summary>
+        private struct Cutting {
+            public Box Box, First, Second;
+            public double Gain;
+        }
+
         private sealed class Map {
             public readonly int Rows;
-            private readonly double[] flux, power;
+            private readonly double[] flux, power, light;
 
             /// <summary>Sum what texels shed into cells of as many rows or fewer.</summary>
             public Map(Vector4[] texels, int texelRows, int rows) {
                 Rows = rows;
                 flux = new double[6 * rows * rows];
                 power = new double[2 * rows * rows];
+                light = new double[8 * rows * rows]; // power, and direction times that
                 for (int y = 0; y < texelRows; y++)
                     for (int x = 0; x < 2 * texelRows; x++) {
                         Vector4 texel = texels[2 * texelRows * y + x];
@@ -71,27 +80,45 @@ namespace Beam.Relightable {
                         flux[3 * cell + 2] += angle * texel.z;
                         power[cell] += angle * (0.2126 * texel.x + 0.7152 * texel.y + 0.0722 * texel.z);
                     }
-                if (Array.Exists(power, each => each > 0.0)) return;
-                for (int cell = 0; cell < power.Length; cell++) power[cell] = AngleOf(cell / (2 * rows), rows); // a black one is cut evenly
+                bool isDark = !Array.Exists(power, each => each > 0.0);
+                for (int cell = 0; cell < power.Length; cell++) {
+                    if (isDark) power[cell] = AngleOf(cell / (2 * rows), rows); // which is cut evenly
+                    double[] way = WayOf(cell);
+                    light[4 * cell] = power[cell];
+                    for (int k = 0; k < 3; k++) light[4 * cell + 1 + k] = power[cell] * way[k];
+                }
             }
 
-            /// <summary>Cut a box where half of its power is on either side; one of a single cell stays, beside an empty one.</summary>
-            public Box[] Halves(Box box) {
+            /// <summary>Find the cut that takes most off a box's variance; one of a single cell stays, beside an empty one.</summary>
+            public Cutting BestCut(Box box) {
                 int tall = box.Bottom - box.Top, wide = box.Right - box.Left;
-                bool isAcross = wide * Math.Sin(Math.PI * 0.5 * (box.Top + box.Bottom) / Rows) > tall;
-                if ((isAcross ? wide : tall) < 2) isAcross = wide > tall;
-                var sums = new double[isAcross ? wide : tall];
-                if (sums.Length < 2) return new[] { box, new Box(box.Bottom, box.Bottom, box.Left, box.Right) };
-                for (int y = box.Top; y < box.Bottom; y++)
-                    for (int x = box.Left; x < box.Right; x++) sums[isAcross ? x - box.Left : y - box.Top] += power[2 * Rows * y + x];
-                for (int k = 1; k < sums.Length; k++) sums[k] += sums[k - 1];
-                double half = 0.5 * sums[sums.Length - 1];
-                int cut = 0;
-                for (int k = 1; k < sums.Length - 1; k++) if (Math.Abs(sums[k] - half) < Math.Abs(sums[cut] - half)) cut = k;
-                int column = box.Left + cut + 1, row = box.Top + cut + 1;
-                return isAcross
-                    ? new[] { new Box(box.Top, box.Bottom, box.Left, column), new Box(box.Top, box.Bottom, column, box.Right) }
-                    : new[] { new Box(box.Top, row, box.Left, box.Right), new Box(row, box.Bottom, box.Left, box.Right) };
+                double[][] sums = { new double[4 * tall + 4], new double[4 * wide + 4] };
+                for (int y = 0; y < tall; y++)
+                    for (int x = 0; x < wide; x++)
+                        for (int c = 0, cell = 2 * Rows * (box.Top + y) + box.Left + x; c < 4; c++) {
+                            sums[0][4 * (y + 1) + c] += light[4 * cell + c];
+                            sums[1][4 * (x + 1) + c] += light[4 * cell + c];
+                        }
+                foreach (double[] one in sums) for (int k = 4; k < one.Length; k++) one[k] += one[k - 4];
+                double whole = Variance(sums[0], 0, tall);
+                var best = new Cutting { Box = box, Gain = -1.0, First = box, Second = new Box(box.Bottom, box.Bottom, box.Left, box.Right) };
+                for (int axis = 0; axis < 2; axis++)
+                    for (int k = 1, end = axis == 0 ? tall : wide; k < end; k++) {
+                        double gain = whole - Variance(sums[axis], 0, k) - Variance(sums[axis], k, end);
+                        if (!(gain > best.Gain)) continue;
+                        int row = box.Top + k, column = box.Left + k;
+                        best.Gain = gain;
+                        best.First = axis == 0 ? new Box(box.Top, row, box.Left, box.Right) : new Box(box.Top, box.Bottom, box.Left, column);
+                        best.Second = axis == 0 ? new Box(row, box.Bottom, box.Left, box.Right) : new Box(box.Top, box.Bottom, column, box.Right);
+                    }
+                return best;
+            }
+
+            /// <summary>Return the power times squared distance from the mean direction, summed between two places of running sums.</summary>
+            private static double Variance(double[] sums, int from, int to) {
+                double all = sums[4 * to] - sums[4 * from], square = 0.0;
+                for (int c = 1; c < 4; c++) square += (sums[4 * to + c] - sums[4 * from + c]) * (sums[4 * to + c] - sums[4 * from + c]);
+                return all - square / Math.Max(all, 1e-300);
             }
 
             /// <summary>Add a box to regions; an empty one sheds no light from above.</summary>
@@ -101,8 +128,7 @@ namespace Beam.Relightable {
                 for (int y = box.Top; y < box.Bottom; y++)
                     for (int x = box.Left; x < box.Right; x++) {
                         int cell = 2 * Rows * y + x;
-                        double theta = (y + 0.5) * Math.PI / Rows, phi = Math.PI - (x + 0.5) * Math.PI / Rows;
-                        double[] way = { Math.Sin(theta) * Math.Cos(phi), Math.Sin(theta) * Math.Sin(phi), Math.Cos(theta) };
+                        double[] way = WayOf(cell);
                         total += 1.0;
                         lit += power[cell];
                         for (int k = 0; k < 3; k++) {
@@ -122,6 +148,11 @@ namespace Beam.Relightable {
                     double size = Length(sums, 3 * c), spread = Math.Max(1.0 - size / Math.Max(fluxes[c], 1e-300), 0.0);
                     into.Moments.Add(new Vector4((float)sums[3 * c], (float)sums[3 * c + 1], (float)sums[3 * c + 2], (float)(size * Math.Sqrt(3.0 * spread))));
                 }
+            }
+
+            private double[] WayOf(int cell) {
+                double theta = (cell / (2 * Rows) + 0.5) * Math.PI / Rows, phi = Math.PI - (cell % (2 * Rows) + 0.5) * Math.PI / Rows;
+                return new[] { Math.Sin(theta) * Math.Cos(phi), Math.Sin(theta) * Math.Sin(phi), Math.Cos(theta) };
             }
 
             private static double AngleOf(int row, int rows) => Math.PI / rows * (Math.Cos(Math.PI * row / rows) - Math.Cos(Math.PI * (row + 1) / rows));

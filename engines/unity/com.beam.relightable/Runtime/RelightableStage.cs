@@ -27,7 +27,7 @@ namespace Beam.Relightable {
         /// <summary>Angle by which the environment is turned about the vertical [degree].</summary>
         public float rotation;
 
-        /// <summary>Regions of the environment that cast shadows, 4, 8, 16 or 32; 0: ambient occlusion stands for them.</summary>
+        /// <summary>Regions of the environment that cast shadows, at most 32; 0: ambient occlusion stands for them.</summary>
         public int environmentShadows;
 
         /// <summary>Exposure of takes [stops].</summary>
