@@ -1,7 +1,9 @@
-"""An environment cut into regions of little spread: few directions that stand for it where shadows are cast.
+"""An environment cut into regions of little blur: few directions that stand for it where shadows are cast.
 
-Source: Viriyothai and Debevec 2009, Variance Minimization Light Probe Sampling. A cut for equal power (Debevec 2005)
-spends most regions on a sun, all of which see the same.
+A region's shadows are as soft as the region is wide. Its blur is its power times the standard deviation of its
+directions; cuts make the sum of blurs small. A cut for equal power (Debevec 2005) spends most regions on a sun, where
+all see the same; one for little variance (Viriyothai and Debevec 2009) leaves the sky around a sun with it, whose
+shadows are then too soft.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ class EnvironmentRegions:
 
     @classmethod
     def of(cls, environment: EnvironmentMap, count: int) -> EnvironmentRegions:
-        """Cut an environment where the variance of its directions, weighted by power, falls most, one cut at a time.
+        """Cut an environment where its blur falls most, one cut at a time.
 
         Args:
             environment: The light; a black one is cut evenly.
@@ -80,7 +82,7 @@ class EnvironmentRegions:
 
 
 def _cut(power: NDArray[np.float64], directions: NDArray[np.float64], count: int) -> list[Box]:
-    """Cut a map into boxes; the cut that takes most of the variance away is made first."""
+    """Cut a map into boxes; the cut that takes most of the blur away is made first."""
     light = power[..., None] * np.concatenate([np.ones_like(directions[..., :1]), directions], axis=2)
     boxes = [(slice(0, power.shape[0]), slice(0, power.shape[1]))]
     cuts = [_best_cut(light, boxes[0])]
@@ -93,7 +95,7 @@ def _cut(power: NDArray[np.float64], directions: NDArray[np.float64], count: int
 
 
 def _best_cut(light: NDArray[np.float64], box: Box) -> tuple[float, tuple[Box, Box]]:
-    """Return what the best cut of a box takes off its variance, and its halves.
+    """Return what the best cut of a box takes off its blur, and its halves.
 
     A box of a single texel is not cut: it stays, beside an empty one, at a gain below all others.
 
@@ -103,12 +105,12 @@ def _best_cut(light: NDArray[np.float64], box: Box) -> tuple[float, tuple[Box, B
     """
     rows, columns = box
     best, halves = -1.0, (box, (slice(rows.stop, rows.stop), columns))
-    whole = _variance(light[box].sum(axis=(0, 1)))
+    whole = _blur(light[box].sum(axis=(0, 1)))
     for axis in range(2):
         sums = np.cumsum(light[box].sum(axis=1 - axis), axis=0)
         if len(sums) < 2:
             continue
-        gains = whole - _variance(sums[:-1]) - _variance(sums[-1] - sums[:-1])
+        gains = whole - _blur(sums[:-1]) - _blur(sums[-1] - sums[:-1])
         place = int(np.argmax(gains))
         if gains[place] > best:
             best, at = float(gains[place]), box[axis].start + place + 1
@@ -118,13 +120,13 @@ def _best_cut(light: NDArray[np.float64], box: Box) -> tuple[float, tuple[Box, B
     return best, halves
 
 
-def _variance(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sum over unit directions of power times squared distance from the mean one, ``(...)``.
+def _blur(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return power times the standard deviation of directions, ``(...)``.
 
     Args:
         sums: Of powers, and of directions times power, ``(..., 4)``.
     """
-    return sums[..., 0] - np.square(sums[..., 1:]).sum(axis=-1) / np.maximum(sums[..., 0], 1e-300)
+    return np.sqrt(np.maximum(np.square(sums[..., 0]) - np.square(sums[..., 1:]).sum(axis=-1), 0.0))
 
 
 def _summed(

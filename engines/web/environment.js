@@ -253,7 +253,7 @@ export function prefilterWorker() {
     return table;
   }
 
-  /** Cut a map into regions of little spread, as beam_warp.light.regions does: where each is, how wide, and its moments. */
+  /** Cut a map into regions of little blur, as beam_warp.light.regions does: where each is, how wide, and its moments. */
   function regionsOf(map, count) {
     const {height: rows, radiance} = resized(map, Math.min(map.height, 256)), columns = 2 * rows;
     const power = new Float64Array(rows * columns), angleOf = (y) => PI / rows * (Math.cos(PI * y / rows) - Math.cos(PI * (y + 1) / rows));
@@ -266,12 +266,12 @@ export function prefilterWorker() {
     const each = ([top, bottom, left, right], visit) => { for (let y = top; y < bottom; y++) for (let x = left; x < right; x++) visit(y * columns + x, y, x); };
     const light = new Float64Array(4 * power.length); // power, and direction times that
     each([0, rows, 0, columns], (i, y, x) => light.set([1, ...directionOf(y, x, rows)].map((value) => value * power[i]), 4 * i));
-    /** Return the power times squared distance from the mean direction, summed between two places of running sums. */
-    const variance = (sums, from, to) => {
+    /** Return power times the standard deviation of directions between two places of running sums. */
+    const blur = (sums, from, to) => {
       const [all, ...d] = [0, 1, 2, 3].map((c) => sums[4 * to + c] - sums[4 * from + c]);
-      return all - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / Math.max(all, 1e-300);
+      return Math.sqrt(Math.max(all * all - d[0] * d[0] - d[1] * d[1] - d[2] * d[2], 0));
     };
-    /** Find the cut that takes most off a box's variance; one of a single texel stays, beside an empty one. */
+    /** Find the cut that takes most off a box's blur; one of a single texel stays, beside an empty one. */
     const bestCut = (box) => {
       const [top, bottom, left, right] = box, best = {box, gain: -1, halves: [box, [bottom, bottom, left, right]]};
       const sums = [bottom - top, right - left].map((size) => new Float64Array(4 * size + 4));
@@ -279,11 +279,11 @@ export function prefilterWorker() {
         for (let c = 0; c < 4; c++) sums[0][4 * (y - top + 1) + c] += light[4 * i + c], sums[1][4 * (x - left + 1) + c] += light[4 * i + c];
       });
       for (const one of sums) for (let k = 4; k < one.length; k++) one[k] += one[k - 4];
-      const whole = variance(sums[0], 0, bottom - top);
+      const whole = blur(sums[0], 0, bottom - top);
       sums.forEach((one, across) => {
         const end = one.length / 4 - 1;
         for (let k = 1; k < end; k++) {
-          const gain = whole - variance(one, 0, k) - variance(one, k, end);
+          const gain = whole - blur(one, 0, k) - blur(one, k, end);
           if (!(gain > best.gain)) continue;
           best.gain = gain;
           best.halves = across ? [[top, bottom, left, left + k], [top, bottom, left + k, right]]
@@ -399,7 +399,7 @@ export class Environment {
     return Object.assign(made, table);
   }
 
-  /** Return a number of regions of little spread: `{direction, halfAngle, moments}` each, in the environment's own axes. */
+  /** Return a number of regions of little blur: `{direction, halfAngle, moments}` each, in the environment's own axes. */
   async regions(count) {
     return (await kept(this.cuts ??= {}, count, () => Environment.made({map: this.maps[1], regions: count}))).regions;
   }

@@ -3,7 +3,7 @@ using System.Collections.Generic;
 using UnityEngine;
 
 namespace Beam.Relightable {
-    /// <summary>Regions of an environment of little spread, in the renderer's world; each casts shadows from where its power is.</summary>
+    /// <summary>Regions of an environment of little blur, in the renderer's world; each casts shadows from where its power is.</summary>
     /// <remarks>They are those of beam_warp/light/regions.py.</remarks>
     public sealed class EnvironmentRegions {
         private const double Widest = 75.0 * Math.PI / 180.0;
@@ -54,7 +54,7 @@ namespace Beam.Relightable {
             }
         }
 
-        /// <summary>A box, its halves, and what cutting it takes off its variance.</summary>
+        /// <summary>A box, its halves, and what cutting it takes off its blur.</summary>
         private struct Cutting {
             public Box Box, First, Second;
             public double Gain;
@@ -89,7 +89,7 @@ namespace Beam.Relightable {
                 }
             }
 
-            /// <summary>Find the cut that takes most off a box's variance; one of a single cell stays, beside an empty one.</summary>
+            /// <summary>Find the cut that takes most off a box's blur; one of a single cell stays, beside an empty one.</summary>
             public Cutting BestCut(Box box) {
                 int tall = box.Bottom - box.Top, wide = box.Right - box.Left;
                 double[][] sums = { new double[4 * tall + 4], new double[4 * wide + 4] };
@@ -100,11 +100,11 @@ namespace Beam.Relightable {
                             sums[1][4 * (x + 1) + c] += light[4 * cell + c];
                         }
                 foreach (double[] one in sums) for (int k = 4; k < one.Length; k++) one[k] += one[k - 4];
-                double whole = Variance(sums[0], 0, tall);
+                double whole = Blur(sums[0], 0, tall);
                 var best = new Cutting { Box = box, Gain = -1.0, First = box, Second = new Box(box.Bottom, box.Bottom, box.Left, box.Right) };
                 for (int axis = 0; axis < 2; axis++)
                     for (int k = 1, end = axis == 0 ? tall : wide; k < end; k++) {
-                        double gain = whole - Variance(sums[axis], 0, k) - Variance(sums[axis], k, end);
+                        double gain = whole - Blur(sums[axis], 0, k) - Blur(sums[axis], k, end);
                         if (!(gain > best.Gain)) continue;
                         int row = box.Top + k, column = box.Left + k;
                         best.Gain = gain;
@@ -114,11 +114,11 @@ namespace Beam.Relightable {
                 return best;
             }
 
-            /// <summary>Return the power times squared distance from the mean direction, summed between two places of running sums.</summary>
-            private static double Variance(double[] sums, int from, int to) {
+            /// <summary>Return power times the standard deviation of directions between two places of running sums.</summary>
+            private static double Blur(double[] sums, int from, int to) {
                 double all = sums[4 * to] - sums[4 * from], square = 0.0;
                 for (int c = 1; c < 4; c++) square += (sums[4 * to + c] - sums[4 * from + c]) * (sums[4 * to + c] - sums[4 * from + c]);
-                return all - square / Math.Max(all, 1e-300);
+                return Math.Sqrt(Math.Max(all * all - square, 0.0));
             }
 
             /// <summary>Add a box to regions; an empty one sheds no light from above.</summary>
