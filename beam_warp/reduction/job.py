@@ -38,9 +38,9 @@ SHARE = 0.95
 TRIED = 40
 """Draws of the search on which a candidate is judged: its worst is then beyond 98 % of all, as a rule."""
 
-GPU_STEPS, CPU_STEPS = 2880, 600
+GPU_STEPS, CPU_STEPS = 8640, 600
 GPU_VIEWS, CPU_VIEWS = 288, 144
-"""Steps and views of a refit that is not told how many: on a GPU every view is seen ten times."""
+"""Steps and views of a refit that is not told how many: on a GPU every view is seen thirty times."""
 
 SAMPLE_FRAMES = 4
 """Frames, evenly over a sequence, that sensitivities are measured in."""

@@ -2,7 +2,8 @@
 
 A pixel shows I = f(G), with G the nine sums of its G-buffer (`COLUMNS`) and f the shading under a light, encoded for
 display. To first order a change of G costs |J dG|^2, with J = df/dG. The mean of J^T J over lights, a matrix M of 9 x 9
-for each pixel, holds all that these lights can tell of a change: no light is needed again. Carried back through the
+for each pixel, holds all that these lights can tell of a change: no light is needed again. What few lights do not tell
+of a pixel, the mean M of all pixels does: it is shrunk towards that (Ledoit and Wolf 2004). Carried back through the
 rasteriser, M weighs what each Gaussian's material may change.
 """
 
@@ -25,6 +26,7 @@ from beam_warp.kernels.reduction.image_forms import (
     launch_add_columns,
     launch_add_edges,
     launch_add_forms,
+    launch_blend_forms,
     launch_carry,
     launch_form_slopes,
     launch_nudge,
@@ -48,6 +50,10 @@ MATERIALS = COLUMNS - 1
 
 LIGHTS = 2
 """Lights over which the matrices of a view are the mean: what one pixel does not tell, those of other views do."""
+
+MEAN_LIGHTS, MEAN_VIEWS = 1.0, 16
+"""Lights that the mean matrix counts as in the matrix of every pixel, and views that it is measured in. Two lights have
+six colour values: alone, they let a pixel's nine sums change freely in three ways, and long refits go these ways."""
 
 STEPS = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03, -0.02])
 """Differences by which shading is differentiated; alpha goes down, since it ends at 1."""
@@ -145,10 +151,24 @@ def measure_sensitivity(
         view, pixel = meter.view(trial, some)
         views.append(view)
         pixels.append(pixel)
+    _blend_mean(views)
     totals = meter.carried.numpy()
     materials = np.zeros((len(totals), MATERIALS, MATERIALS), np.float32)
     materials[:, TRIANGLE[0], TRIANGLE[1]] = materials[:, TRIANGLE[1], TRIANGLE[0]] = totals[:, :count]
     return Sensitivity(tuple(views), totals[:, count + 1], totals[:, count], materials, float(np.mean(pixels)))
+
+
+def _blend_mean(views: Sequence[SeenView]) -> None:
+    """Take the mean form of all pixels into the form of each, as further lights that it is known under."""
+    some = [view.forms.numpy() for view in views[:: max(1, len(views) // MEAN_VIEWS)]]
+    forms = np.concatenate(some, dtype=np.float64)
+    if not len(forms):
+        return
+    share = MEAN_LIGHTS / (LIGHTS + MEAN_LIGHTS)
+    mean = forms.mean(axis=0).astype(np.float32)
+    for view in views:
+        device = view.forms.device
+        launch_blend_forms(len(view.forms), wp.array(mean, dtype=float, device=device), share, view.forms, device)
 
 
 class _Meter:

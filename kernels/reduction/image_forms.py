@@ -71,6 +71,14 @@ def add_forms_kernel(
 
 
 @wp.kernel
+def blend_forms_kernel(first: int, mean: wp.array[float], share: float, out_forms: wp.array2d[float]):
+    """Forms become so much of the mean one."""
+    i = first + wp.tid()
+    for entry in range(out_forms.shape[1]):
+        out_forms[i, entry] += share * (mean[entry] - out_forms[i, entry])
+
+
+@wp.kernel
 def add_edges_kernel(
     first: int, width: int, height: int, shades: wp.array2d[wp.vec4], share: float, out_edges: wp.array[float]
 ):
@@ -163,6 +171,7 @@ def form_slopes_kernel(
 
 launch_nudge = launcher(nudge_kernel)
 launch_add_forms = launcher(add_forms_kernel)
+launch_blend_forms = launcher(blend_forms_kernel)
 launch_add_edges = launcher(add_edges_kernel)
 launch_carry = launcher(carry_kernel)
 launch_add_columns = launcher(add_columns_kernel)

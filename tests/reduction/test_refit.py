@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from beam_warp.device.arrays import resolve_device
 from beam_warp.reduction import refit as module
+from beam_warp.reduction import sensitivity
 from beam_warp.reduction.job import Reducer
 from beam_warp.reduction.refit import _Refit, refit
 from beam_warp.world.clusters import Clusters
+from beam_warp.world.gaussians import GaussianSequence
 
 
 @pytest.fixture(params=["cpu", "cuda"])
@@ -23,6 +25,28 @@ def merged(request):
     reducer = Reducer(ball(), LIGHTS, replace(QUICK, height=64, device=request.param))
     cloud = Clusters(ball()[0], reducer._order.labels(60), reducer.sensitivity.visible).cloud(ball()[0])
     return reducer, cloud
+
+
+def squares(forms):
+    """Forms of 9 x 9 from their lower triangles."""
+    rows, columns = np.tril_indices(9)
+    whole = np.zeros((len(forms), 9, 9))
+    whole[:, rows, columns] = whole[:, columns, rows] = forms
+    return whole
+
+
+def test_forms_leave_no_change_of_a_pixel_free(monkeypatch):
+    """Of two lights alone a pixel's form is singular; with the mean of all as a third one it is not. Occlusion below 1
+    has room to rise, so that images depend on it."""
+    shaded = GaussianSequence.from_clouds([ball()[0].with_arrays(ambient_occlusion=np.full(300, 0.8))])
+    blended = Reducer(shaded, LIGHTS, QUICK).sensitivity
+    monkeypatch.setattr(sensitivity, "MEAN_LIGHTS", 0.0)
+    alone = Reducer(shaded, LIGHTS, QUICK).sensitivity
+    forms = [np.concatenate([view.forms.numpy() for view in each.views]) for each in (blended, alone)]
+    least = [np.linalg.eigvalsh(squares(each))[:, 0] for each in forms]
+    assert np.abs(least[1]).max() < 1e-6
+    assert least[0].min() > 1e-5
+    np.testing.assert_allclose(forms[0].mean(axis=0), forms[1].mean(axis=0), rtol=1e-3, atol=1e-6)
 
 
 def slopes_of(work: _Refit, view: int) -> list[np.ndarray]:
