@@ -95,6 +95,7 @@ class Bench:
     assets: tuple[str, ...]
     made: Path | None
     device: Any
+    contenders: tuple[str, ...] = ()
 
 
 def asset(name: str, bench: Bench) -> GaussianSequence:
@@ -217,7 +218,8 @@ def sizes(bench: Bench) -> Iterator[Row]:
     """Reduce every asset to every share by every contender; rivals wait until all assets have been reduced."""
     rows: list[Row] = []
     subjects = [subject(name, bench) for name in bench.assets]
-    for contender, keep in CONTENDERS.items():
+    for contender in bench.contenders:
+        keep = CONTENDERS[contender]
         for (known, reducer, cloud, judge), share in product(subjects, bench.shares):
             name = known["asset"]
             row: Row = {"name": f"{name} {share:g} {contender}", "share": share, "contender": contender, **known}
@@ -303,6 +305,7 @@ def main() -> int:
     parser = record.parser(__doc__, device="cpu", quick="the figure, small, a few steps", parts=PARTS)
     parser.add_argument("--made", type=Path, metavar="FOLDER", help="assets of captures, and what rivals made of them")
     parser.add_argument("--assets", nargs="+", default=["figure", *CAPTURES], metavar="NAME")
+    parser.add_argument("--contenders", nargs="+", default=list(CONTENDERS), choices=CONTENDERS, metavar="NAME")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     default = ReduceOptions(gaussians=1)
@@ -313,7 +316,7 @@ def main() -> int:
         arguments.assets, count, height, tests, views, steps = ["figure"], 800, 48, 4, 4, 4
     options = ReduceOptions(gaussians=1, height=height, views=views, steps=steps, device=device)
     shares = (0.2,) if arguments.quick else (0.2, 0.1)
-    bench = Bench(count, shares, tests, options, tuple(arguments.assets), arguments.made, device)
+    bench = Bench(count, shares, tests, options, tuple(arguments.assets), arguments.made, device, tuple(arguments.contenders))
     return measure_all(PARTS, bench, arguments, device, arguments.parts)
 
 
