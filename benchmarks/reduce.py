@@ -316,7 +316,9 @@ def main() -> int:
         arguments.assets, count, height, tests, views, steps = ["figure"], 800, 48, 4, 4, 4
     options = ReduceOptions(gaussians=1, height=height, views=views, steps=steps, device=device)
     shares = (0.2,) if arguments.quick else (0.2, 0.1)
-    bench = Bench(count, shares, tests, options, tuple(arguments.assets), arguments.made, device, tuple(arguments.contenders))
+    bench = Bench(
+        count, shares, tests, options, tuple(arguments.assets), arguments.made, device, tuple(arguments.contenders)
+    )
     return measure_all(PARTS, bench, arguments, device, arguments.parts)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from tables import Row, Rows, cell, figure, table
 
-REDUCE, NOW = "reduce_h200.json", "reduce_now_h200.json"
+REDUCE = "reduce_h200.json"
 
 
 def told_apart(rows: Iterable[Row], key: str) -> list[Any]:
@@ -18,7 +18,6 @@ def told_apart(rows: Iterable[Row], key: str) -> list[Any]:
 
 
 @table("reduce_sizes", REDUCE)
-@table("reduce_sizes_now", NOW)
 def sizes(result: Row) -> Rows:
     """Return PSNR against the original and loss against the truth of every contender, by asset."""
     head = ["asset", "kept", "by", "PSNR [dB]", "loss [dB]", "refitted: PSNR [dB]", "loss [dB]", "counted loss [dB]"]
@@ -35,7 +34,6 @@ def sizes(result: Row) -> Rows:
 
 
 @table("reduce_certified", REDUCE)
-@table("reduce_certified_now", NOW)
 def certified(result: Row) -> Rows:
     """Return whole calls: seconds, what they state, and what fresh draws say."""
     rows: list[list[Any]] = [["asset", "asked", "Gaussians", "seconds", "bound [dB]", "stated for", "held in"]]

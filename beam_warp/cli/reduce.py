@@ -71,7 +71,7 @@ class Reduce:
         None
     )
     steps: Annotated[
-        int | None, arg(metavar="N", help="Steps of a refit; by default 2880 on a GPU, 600 elsewhere."), SECOND_PAGE
+        int | None, arg(metavar="N", help="Steps of a refit; by default 8640 on a GPU, 600 elsewhere."), SECOND_PAGE
     ] = None
     reading: OmitArgPrefixes[ReadingFlags] = field(default_factory=ReadingFlags)
     seed: Seed = 0

@@ -67,11 +67,11 @@ CHANCE = 1e-3
 
 MODEL_ERROR = 0.015
 """Error of the logarithms of exposures that halves of the points share, because the surface is wrong: cameras of
-walker, runner and robot, whose exposures are equal, seem to differ by 0.006, 0.007 and 0.018 (root mean square)."""
+walker, runner and robot, whose exposures are equal, seem to differ by 0.005, 0.005 and 0.017 (root mean square)."""
 
 FALLOFF_ERROR = 0.15
-"""Error of the power of vignetting that halves of the points share, because the surface is wrong: that of walker,
-runner and robot, whose cameras are pinholes, seems to be 0.02, -0.12 and -0.14."""
+"""Error of the power of vignetting that halves of the points share, because the surface is wrong: that of walker
+and runner, whose cameras are pinholes, seems to be 0.00 and -0.02, or -0.12 on worse surfaces; robot's says nothing."""
 
 FIRST_POINTS, MOST_POINTS = 1_024, 4_096
 """Most points that are compared, evenly chosen: at first, and where these say that something may be wrong."""

@@ -65,7 +65,7 @@ namespace Beam.Relightable {
             return found;
         }
 
-        /// <summary>Return a number of regions of little spread. The first time waits for the graphics card.</summary>
+        /// <summary>Return a number of regions of little blur. The first time waits for the graphics card.</summary>
         public EnvironmentRegions Regions(int count) {
             if (regions != null && cutInto == count) return regions;
             var texels = new Vector4[(int)Levels[1].y];
