@@ -72,7 +72,7 @@ def reducer() -> Reducer:
 
 
 def test_quadratic_forms_predict_the_error_of_a_small_change(monkeypatch):
-    # The twin draws both assets by the renderer, under the lights of one view that have no lamp. The forms of these lights
+    # The twin draws both assets by the renderer, under the lights of one view that have no lamp. Forms of these lights
     # alone predict it; refits take the mean form of all pixels as a further light.
     monkeypatch.setattr(sensitivity, "MEAN_LIGHTS", 0.0)
     reducer = Reducer(ball(), LIGHTS, QUICK)

@@ -36,7 +36,7 @@ def squares(forms):
 
 
 def test_forms_leave_no_change_of_a_pixel_free(monkeypatch):
-    """Of two lights alone a pixel's form is singular; with the mean of all as a third one it is not. Occlusion below 1
+    """A pixel's form of two lights alone is singular; with the mean of all as a third one it is not. Occlusion below 1
     has room to rise, so that images depend on it."""
     shaded = GaussianSequence.from_clouds([ball()[0].with_arrays(ambient_occlusion=np.full(300, 0.8))])
     blended = Reducer(shaded, LIGHTS, QUICK).sensitivity
