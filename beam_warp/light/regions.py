@@ -8,6 +8,7 @@ shadows are then too soft.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,9 @@ LARGEST_HEIGHT = 256
 MOST_REGIONS = 256
 WIDEST = np.radians(75.0)
 """Largest half angle of a region's disc."""
+
+ALIKE = 1e-6
+"""Difference of two cuts' gains that is rounding, as a share of the map's power."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +87,12 @@ class EnvironmentRegions:
 
 def _cut(power: NDArray[np.float64], directions: NDArray[np.float64], count: int) -> list[Box]:
     """Cut a map into boxes; the cut that takes most of the blur away is made first."""
-    light = power[..., None] * np.concatenate([np.ones_like(directions[..., :1]), directions], axis=2)
+    share = (power / power.sum())[..., None]
+    light = share * np.concatenate([np.ones_like(directions[..., :1]), directions], axis=2)
     boxes = [(slice(0, power.shape[0]), slice(0, power.shape[1]))]
     cuts = [_best_cut(light, boxes[0])]
     while len(boxes) < count:
-        most = int(np.argmax([gain for gain, _ in cuts]))
+        most = _first_best([gain for gain, _ in cuts])
         _, halves = cuts[most]
         boxes[most : most + 1] = halves
         cuts[most : most + 1] = [_best_cut(light, half) for half in halves]
@@ -100,24 +105,27 @@ def _best_cut(light: NDArray[np.float64], box: Box) -> tuple[float, tuple[Box, B
     A box of a single texel is not cut: it stays, beside an empty one, at a gain below all others.
 
     Args:
-        light: Power of every texel, and its direction times that, ``(R, C, 4)``.
+        light: Share of the power of every texel, and its direction times that, ``(R, C, 4)``.
         box: Rows and columns.
     """
     rows, columns = box
-    best, halves = -1.0, (box, (slice(rows.stop, rows.stop), columns))
-    whole = _blur(light[box].sum(axis=(0, 1)))
+    found = []
     for axis in range(2):
         sums = np.cumsum(light[box].sum(axis=1 - axis), axis=0)
-        if len(sums) < 2:
-            continue
-        gains = whole - _blur(sums[:-1]) - _blur(sums[-1] - sums[:-1])
-        place = int(np.argmax(gains))
-        if gains[place] > best:
-            best, at = float(gains[place]), box[axis].start + place + 1
-            sides = slice(box[axis].start, at), slice(at, box[axis].stop)
-            first, second = ((side, columns) if axis == 0 else (rows, side) for side in sides)
-            halves = first, second
-    return best, halves
+        for place, gain in enumerate(_blur(sums[-1:]) - _blur(sums[:-1]) - _blur(sums[-1:] - sums[:-1])):
+            found.append((float(gain), axis, place + 1))
+    if not found:
+        return -1.0, (box, (slice(rows.stop, rows.stop), columns))
+    gain, axis, place = found[_first_best([gain for gain, _, _ in found])]
+    at = box[axis].start + place
+    sides = slice(box[axis].start, at), slice(at, box[axis].stop)
+    first, second = ((side, columns) if axis == 0 else (rows, side) for side in sides)
+    return gain, (first, second)
+
+
+def _first_best(gains: Sequence[float]) -> int:
+    """Return the place of the first of the largest gains: mirror images gain alike, whatever their rounding."""
+    return int(np.argmax(np.asarray(gains) >= max(gains) - ALIKE))
 
 
 def _blur(sums: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -264,8 +264,13 @@ export function prefilterWorker() {
     weigh(false);
     if (!power.some((value) => value > 0)) weigh(true);
     const each = ([top, bottom, left, right], visit) => { for (let y = top; y < bottom; y++) for (let x = left; x < right; x++) visit(y * columns + x, y, x); };
-    const light = new Float64Array(4 * power.length); // power, and direction times that
-    each([0, rows, 0, columns], (i, y, x) => light.set([1, ...directionOf(y, x, rows)].map((value) => value * power[i]), 4 * i));
+    const light = new Float64Array(4 * power.length), all = power.reduce((sum, value) => sum + value, 0); // share of the power, and direction times that
+    each([0, rows, 0, columns], (i, y, x) => light.set([1, ...directionOf(y, x, rows)].map((value) => value * power[i] / all), 4 * i));
+    /** Return the first of the largest gains: mirror images gain alike, whatever their rounding. */
+    const firstBest = (cuts) => {
+      const most = cuts.reduce((found, {gain}) => Math.max(found, gain), -1);
+      return cuts.findIndex(({gain}) => gain >= most - 1e-6);
+    };
     /** Return power times the standard deviation of directions between two places of running sums. */
     const blur = (sums, from, to) => {
       const [all, ...d] = [0, 1, 2, 3].map((c) => sums[4 * to + c] - sums[4 * from + c]);
@@ -273,28 +278,24 @@ export function prefilterWorker() {
     };
     /** Find the cut that takes most off a box's blur; one of a single texel stays, beside an empty one. */
     const bestCut = (box) => {
-      const [top, bottom, left, right] = box, best = {box, gain: -1, halves: [box, [bottom, bottom, left, right]]};
+      const [top, bottom, left, right] = box, found = [];
       const sums = [bottom - top, right - left].map((size) => new Float64Array(4 * size + 4));
       each(box, (i, y, x) => {
         for (let c = 0; c < 4; c++) sums[0][4 * (y - top + 1) + c] += light[4 * i + c], sums[1][4 * (x - left + 1) + c] += light[4 * i + c];
       });
       for (const one of sums) for (let k = 4; k < one.length; k++) one[k] += one[k - 4];
-      const whole = blur(sums[0], 0, bottom - top);
       sums.forEach((one, across) => {
-        const end = one.length / 4 - 1;
-        for (let k = 1; k < end; k++) {
-          const gain = whole - blur(one, 0, k) - blur(one, k, end);
-          if (!(gain > best.gain)) continue;
-          best.gain = gain;
-          best.halves = across ? [[top, bottom, left, left + k], [top, bottom, left + k, right]]
-            : [[top, top + k, left, right], [top + k, bottom, left, right]];
-        }
+        const end = one.length / 4 - 1, whole = blur(one, 0, end);
+        for (let k = 1; k < end; k++) found.push({gain: whole - blur(one, 0, k) - blur(one, k, end), across, k});
       });
-      return best;
+      if (!found.length) return {box, gain: -1, halves: [box, [bottom, bottom, left, right]]};
+      const {gain, across, k} = found[firstBest(found)];
+      return {box, gain, halves: across ? [[top, bottom, left, left + k], [top, bottom, left + k, right]]
+        : [[top, top + k, left, right], [top + k, bottom, left, right]]};
     };
     const cuts = [bestCut([0, rows, 0, columns])];
     while (cuts.length < count) {
-      const most = cuts.reduce((found, {gain}, k) => gain > cuts[found].gain ? k : found, 0);
+      const most = firstBest(cuts);
       cuts.splice(most, 1, ...cuts[most].halves.map(bestCut));
     }
     return cuts.map(({box}) => {

@@ -86,6 +86,18 @@ def test_a_sun_is_a_region_and_the_sky_has_the_others():
     assert np.delete(power, strongest).max() < 0.01 * power[strongest]
 
 
+def test_rounding_does_not_choose_between_cuts_that_gain_alike():
+    """A window in an even wall: cuts to the left and to the right of it are mirror images."""
+    radiance = np.full((16, 32, 3), 0.3)
+    radiance[3:7, 20:26] = (6.0, 5.0, 4.0)
+    regions = EnvironmentRegions.of(EnvironmentMap(radiance.astype(np.float32)), 16)
+    for seed in range(4):
+        noise = 1.0 + 1e-7 * np.random.default_rng(seed).normal(size=radiance.shape)
+        other = EnvironmentRegions.of(EnvironmentMap((radiance * noise).astype(np.float32)), 16)
+        np.testing.assert_allclose(other.directions, regions.directions, atol=1e-5)
+        np.testing.assert_allclose(other.half_angles, regions.half_angles, atol=1e-4)
+
+
 def test_turning_is_turning_the_map(rng):
     """A map turned by whole columns has the same texels; cuts at other columns than 0 do not matter for one region."""
     light = cloudy(rng)

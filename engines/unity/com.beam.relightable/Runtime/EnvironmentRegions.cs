@@ -6,7 +6,7 @@ namespace Beam.Relightable {
     /// <summary>Regions of an environment of little blur, in the renderer's world; each casts shadows from where its power is.</summary>
     /// <remarks>They are those of beam_warp/light/regions.py.</remarks>
     public sealed class EnvironmentRegions {
-        private const double Widest = 75.0 * Math.PI / 180.0;
+        private const double Widest = 75.0 * Math.PI / 180.0, Alike = 1e-6;
 
         /// <summary>Unit vectors towards their light.</summary>
         public readonly List<Vector3> Directions = new List<Vector3>();
@@ -22,8 +22,7 @@ namespace Beam.Relightable {
             var map = new Map(texels, rows, Math.Min(rows, mostRows));
             var cuts = new List<Cutting> { map.BestCut(new Box(0, map.Rows, 0, 2 * map.Rows)) };
             while (cuts.Count < count) {
-                int most = 0;
-                for (int k = 1; k < cuts.Count; k++) if (cuts[k].Gain > cuts[most].Gain) most = k;
+                int most = FirstBest(cuts.ConvertAll(each => each.Gain));
                 Cutting cut = cuts[most];
                 cuts[most] = map.BestCut(cut.First);
                 cuts.Insert(most + 1, map.BestCut(cut.Second));
@@ -54,6 +53,13 @@ namespace Beam.Relightable {
             }
         }
 
+        /// <summary>Return the place of the first of the largest gains: mirror images gain alike, whatever their rounding.</summary>
+        private static int FirstBest(List<double> gains) {
+            double most = -1.0;
+            foreach (double gain in gains) most = Math.Max(most, gain);
+            return gains.FindIndex(gain => gain >= most - Alike);
+        }
+
         /// <summary>A box, its halves, and what cutting it takes off its blur.</summary>
         private struct Cutting {
             public Box Box, First, Second;
@@ -69,7 +75,7 @@ namespace Beam.Relightable {
                 Rows = rows;
                 flux = new double[6 * rows * rows];
                 power = new double[2 * rows * rows];
-                light = new double[8 * rows * rows]; // power, and direction times that
+                light = new double[8 * rows * rows]; // share of the power, and direction times that
                 for (int y = 0; y < texelRows; y++)
                     for (int x = 0; x < 2 * texelRows; x++) {
                         Vector4 texel = texels[2 * texelRows * y + x];
@@ -81,11 +87,15 @@ namespace Beam.Relightable {
                         power[cell] += angle * (0.2126 * texel.x + 0.7152 * texel.y + 0.0722 * texel.z);
                     }
                 bool isDark = !Array.Exists(power, each => each > 0.0);
+                double all = 0.0;
                 for (int cell = 0; cell < power.Length; cell++) {
                     if (isDark) power[cell] = AngleOf(cell / (2 * rows), rows); // which is cut evenly
+                    all += power[cell];
+                }
+                for (int cell = 0; cell < power.Length; cell++) {
                     double[] way = WayOf(cell);
-                    light[4 * cell] = power[cell];
-                    for (int k = 0; k < 3; k++) light[4 * cell + 1 + k] = power[cell] * way[k];
+                    light[4 * cell] = power[cell] / all;
+                    for (int k = 0; k < 3; k++) light[4 * cell + 1 + k] = power[cell] / all * way[k];
                 }
             }
 
@@ -100,18 +110,18 @@ namespace Beam.Relightable {
                             sums[1][4 * (x + 1) + c] += light[4 * cell + c];
                         }
                 foreach (double[] one in sums) for (int k = 4; k < one.Length; k++) one[k] += one[k - 4];
-                double whole = Blur(sums[0], 0, tall);
-                var best = new Cutting { Box = box, Gain = -1.0, First = box, Second = new Box(box.Bottom, box.Bottom, box.Left, box.Right) };
+                var gains = new List<double>();
                 for (int axis = 0; axis < 2; axis++)
-                    for (int k = 1, end = axis == 0 ? tall : wide; k < end; k++) {
-                        double gain = whole - Blur(sums[axis], 0, k) - Blur(sums[axis], k, end);
-                        if (!(gain > best.Gain)) continue;
-                        int row = box.Top + k, column = box.Left + k;
-                        best.Gain = gain;
-                        best.First = axis == 0 ? new Box(box.Top, row, box.Left, box.Right) : new Box(box.Top, box.Bottom, box.Left, column);
-                        best.Second = axis == 0 ? new Box(row, box.Bottom, box.Left, box.Right) : new Box(box.Top, box.Bottom, column, box.Right);
-                    }
-                return best;
+                    for (int k = 1, end = axis == 0 ? tall : wide; k < end; k++)
+                        gains.Add(Blur(sums[axis], 0, end) - Blur(sums[axis], 0, k) - Blur(sums[axis], k, end));
+                if (gains.Count == 0) return new Cutting { Box = box, Gain = -1.0, First = box, Second = new Box(box.Bottom, box.Bottom, box.Left, box.Right) };
+                int best = FirstBest(gains), rowCuts = Math.Max(tall - 1, 0), row = box.Top + best + 1, column = box.Left + best - rowCuts + 1;
+                bool isRow = best < rowCuts;
+                return new Cutting {
+                    Box = box, Gain = gains[best],
+                    First = isRow ? new Box(box.Top, row, box.Left, box.Right) : new Box(box.Top, box.Bottom, box.Left, column),
+                    Second = isRow ? new Box(row, box.Bottom, box.Left, box.Right) : new Box(box.Top, box.Bottom, column, box.Right)
+                };
             }
 
             /// <summary>Return power times the standard deviation of directions between two places of running sums.</summary>
