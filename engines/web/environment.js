@@ -264,8 +264,8 @@ export function prefilterWorker() {
     weigh(false);
     if (!power.some((value) => value > 0)) weigh(true);
     const each = ([top, bottom, left, right], visit) => { for (let y = top; y < bottom; y++) for (let x = left; x < right; x++) visit(y * columns + x, y, x); };
-    const light = new Float64Array(4 * power.length), all = power.reduce((sum, value) => sum + value, 0); // share of the power, and direction times that
-    each([0, rows, 0, columns], (i, y, x) => light.set([1, ...directionOf(y, x, rows)].map((value) => value * power[i] / all), 4 * i));
+    const light = new Float64Array(4 * power.length), total = power.reduce((sum, value) => sum + value); // share of power, and times direction
+    each([0, rows, 0, columns], (i, y, x) => light.set([1, ...directionOf(y, x, rows)].map((value) => value * power[i] / total), 4 * i));
     /** Return the first of the largest gains: mirror images gain alike, whatever their rounding. */
     const firstBest = (cuts) => {
       const most = cuts.reduce((found, {gain}) => Math.max(found, gain), -1);
