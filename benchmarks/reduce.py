@@ -95,7 +95,7 @@ class Bench:
     assets: tuple[str, ...]
     made: Path | None
     device: Any
-    contenders: tuple[str, ...] = ()
+    contenders: tuple[str, ...]
 
 
 def asset(name: str, bench: Bench) -> GaussianSequence:

@@ -49,7 +49,7 @@ COLUMNS = 9
 MATERIALS = COLUMNS - 1
 
 LIGHTS = 2
-"""Lights over which the matrices of a view are the mean: what one pixel does not tell, those of other views do."""
+"""Lights over which the matrices of a view are the mean: more cost time, and refits gain nothing by them."""
 
 MEAN_LIGHTS, MEAN_VIEWS = 1.0, 16
 """Lights that the mean matrix counts as in the matrix of every pixel, and views that it is measured in. Two lights have
