@@ -14,6 +14,7 @@ CHOICES = "reconstruction_choices_h200.json"
 STRIDES = "reconstruction_strides_h200.json"
 WALK, WITH_CASE = "steady_walk_h200.json", "steady_case_h200.json"
 EXPOSURES = "exposures_cpu.json"
+STATUE = "statue_h200.json"
 
 MEASURES: tuple[tuple[str, Callable[[Row], float]], ...] = (
     ("PSNR of novel views, in the box [dB]", lambda row: row["psnr"]),
@@ -240,6 +241,33 @@ def exposures(result: Row) -> Rows:
         blamed = f"{sum(row['blamed'] for row in same)} of {right:,}"
         found.append([f"{count}", f"{ends[0]:.2f}", *cells, f"{ends[1]:.2f}", blamed])
     return found
+
+
+@table("statue", STATUE)
+def statue(result: Row) -> Rows:
+    """Return how far each photograph is met that was left out."""
+    head = ["left out", "PSNR [dB]", "matched [dB]", "red, green, blue", "covered", "exposures matched", "seconds"]
+    return [
+        head,
+        *(
+            [
+                row["photograph"],
+                f"{row['psnr']:.1f}",
+                f"{row['matched']:.1f}",
+                ", ".join(f"{gain:.2f}" for gain in row["gains"]),
+                f"{100.0 * row['covered']:.0f} %",
+                "yes" if row["matched_cameras"] else "no",
+                f"{row['seconds']:.1f}",
+            ]
+            for row in result["rows"]
+        ),
+    ]
+
+
+@figure("statue.webp", STATUE)
+def draw_statue(_: Row, path: Path) -> None:
+    """Show each photograph that was left out beside what the others show."""
+    draw_sheet(PICTURES / "statue.png", path)
 
 
 @figure("reconstruction.webp", MAIN, CHOICES)

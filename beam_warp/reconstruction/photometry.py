@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,13 +65,29 @@ NEIGHBORS = 8
 CHANCE = 1e-3
 """Probability below which differences of gains are not chance."""
 
-MODEL_ERROR = 0.015
-"""Error of the logarithms of exposures that halves of the points share, because the surface is wrong: cameras of
-walker, runner and robot, whose exposures are equal, seem to differ by 0.005, 0.005 and 0.017 (root mean square)."""
 
-FALLOFF_ERROR = 0.15
-"""Error of the power of vignetting that halves of the points share, because the surface is wrong: that of walker
-and runner, whose cameras are pinholes, seems to be 0.00 and -0.02, or -0.12 on worse surfaces; robot's says nothing."""
+class SharedErrors(NamedTuple):
+    """Errors that halves of the points share, because the surface or what is known of its gloss is wrong.
+
+    Attributes:
+        exposure: Of the logarithms of exposures, root mean square.
+        balance: Of those of white balances, likewise.
+        falloff: Of the power of vignetting.
+    """
+
+    exposure: float
+    balance: float
+    falloff: float
+
+
+MODEL_ERRORS = SharedErrors(0.015, 0.0, 0.15)
+"""Where the light is known: cameras of walker, runner and robot, whose exposures are equal, seem to differ by 0.005,
+0.005 and 0.017. The power of walker and runner, whose cameras are pinholes, seems to be 0.00 and -0.02, or -0.12 on
+worse surfaces; robot's says nothing."""
+
+MATTE_ERRORS = SharedErrors(0.06, 0.03, 0.3)
+"""Where it is not, so that all looks matte: all cameras, or eight, of walker, runner and robot seem to differ by 0.02,
+0.02 and 0.06 on their true surfaces, white balances by 0.005, 0.005 and 0.03, powers by 0.1, 0.3 and 0.3."""
 
 FIRST_POINTS, MOST_POINTS = 1_024, 4_096
 """Most points that are compared, evenly chosen: at first, and where these say that something may be wrong."""
@@ -83,8 +99,9 @@ is wrong, and so is the gloss that is expected of it."""
 FEWEST_POINTS = 64
 """Fewest points that tell gains."""
 
-LEAST_VIEWS = 4
-"""Views that a point is seen by at least: three numbers of its own are found."""
+LEAST_VIEWS, LEAST_MATTE_VIEWS = 4, 3
+"""Views that a point is seen by at least where its gloss is looked for, and where it is not: two views could not tell
+whether the surface is right."""
 
 DARKEST = 0.03
 """Part of the median colour below which a point is left out: its noise and what it mirrors are as large as itself."""
@@ -116,6 +133,7 @@ class SolvedGains:
         gloss: Half of what the model of gloss changes.
         falloff: Power of the cosine that darkens images off the axis.
         falloff_error: Its standard error.
+        shared: Errors that neither of these tells.
     """
 
     logs: NDArray[np.float64]
@@ -123,6 +141,7 @@ class SolvedGains:
     gloss: NDArray[np.float64]
     falloff: float = 0.0
     falloff_error: float = 0.0
+    shared: SharedErrors = MODEL_ERRORS
 
     def error(self, what: NDArray[np.float64]) -> float:
         """Return the standard error, root mean square, of linear functions of the logarithms, ``(3, k)``."""
@@ -142,12 +161,12 @@ class SolvedGains:
     @property
     def vignettes(self) -> bool:
         """Whether images are darker off the axis beyond chance: none is brighter there."""
-        return bool(self.falloff > -ndtri(CHANCE) * np.hypot(self.falloff_error, FALLOFF_ERROR))
+        return bool(self.falloff > -ndtri(CHANCE) * np.hypot(self.falloff_error, self.shared.falloff))
 
 
 def may_compare(views: Sequence[CapturedView]) -> bool:
-    """Return whether views are as many as it takes, and show where the subject ends."""
-    return len(views) >= FEWEST_CAMERAS and all(view.alpha is not None for view in views)
+    """Return whether views are as many as it takes, and all or none show where the subject ends."""
+    return len(views) >= FEWEST_CAMERAS and len({view.alpha is None for view in views}) == 1
 
 
 def find_exposures(
@@ -155,7 +174,7 @@ def find_exposures(
     views: Sequence[CapturedView],
     cloud: GaussianCloud,
     normals: NDArray[np.floating],
-    environment: EnvironmentMap,
+    environment: EnvironmentMap | None,
     *,
     device: str | None = None,
 ) -> RigExposures | None:
@@ -166,7 +185,8 @@ def find_exposures(
         views: The photograph of each of them at one moment.
         cloud: The Gaussians of that moment.
         normals: Which way the surface faces, ``(N, 3)``; 0 where it is not known.
-        environment: The light of the capture, in units of the photographs.
+        environment: The light of the capture, in units of the photographs; without, the surface is taken as matte, and
+            gloss as a larger error.
         device: Warp device; None takes the first CUDA device, or the CPU.
 
     Returns:
@@ -177,13 +197,16 @@ def find_exposures(
     """
     normals, agreement = smoothed(cloud.positions, normals)
     samples = view_samples(views, cloud, normals, device=device).numpy()
-    rows = smoothest(np.where((samples[..., 3] > 0.0).sum(axis=0) >= LEAST_VIEWS, agreement, 0.0))
+    least = LEAST_MATTE_VIEWS if environment is None else LEAST_VIEWS
+    rows = smoothest(np.where((samples[..., 3] > 0.0).sum(axis=0) >= least, agreement, 0.0))
     solved = None
     for most in (FIRST_POINTS, MOST_POINTS):
         chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), 2 * most)).astype(int)]
         away = np.stack([view.camera.position for view in views])[:, None] - cloud.positions[chosen].astype(np.float64)
         away /= np.linalg.norm(away, axis=2, keepdims=True)
-        gloss = highlights(normals[chosen].astype(np.float64), away, environment, device)
+        gloss = np.zeros((*away.shape, 0))
+        if environment is not None:
+            gloss = highlights(normals[chosen].astype(np.float64), away, environment, device)
         axes = np.stack([view.camera.forward for view in views])
         cosines = -(away * axes[:, None]).sum(axis=2)
         solved = solve_gains(samples[:, chosen], gloss, cosines, most)
@@ -254,7 +277,7 @@ def solve_gains(
 
     Args:
         samples: Scene-linear colour and weight of each point in each view, 0 where it is not seen, ``(V, N, 4)``.
-        gloss: Highlights of a smooth dielectric for each roughness, ``(V, N, 3, K)``.
+        gloss: Highlights of a smooth dielectric for each roughness, ``(V, N, 3, K)``; K = 0 where they are not known.
         cosines: Of the angle between each point and the optical axis of each view, ``(V, N)``.
         most: Most points that are compared, evenly chosen.
         vignetting: Whether vignetting is among the unknowns; if not, gains are those of lenses without, and its power
@@ -267,7 +290,8 @@ def solve_gains(
     weights = np.where(colors.min(axis=2) > 0.0, weights, 0.0)
     totals = weights.sum(axis=0)
     means = (colors * weights[..., None]).sum(axis=0) / np.maximum(totals, 1e-300)[:, None]
-    known = (weights > 0.0).sum(axis=0) >= LEAST_VIEWS
+    is_matte = gloss.shape[3] == 0
+    known = (weights > 0.0).sum(axis=0) >= (LEAST_MATTE_VIEWS if is_matte else LEAST_VIEWS)
     known &= (means > DARKEST * np.median(means[known], axis=0)).all(axis=1) if known.any() else known
     rows = np.flatnonzero(known)
     if len(rows) < FEWEST_POINTS:
@@ -292,6 +316,7 @@ def solve_gains(
         *(logs[:-1].reshape(views, 3) for logs in (every, apart, of_gloss)),
         falloff=float(every[-1]),
         falloff_error=float(np.hypot(apart[-1], of_gloss[-1])),
+        shared=MATTE_ERRORS if is_matte else MODEL_ERRORS,
     )
 
 
@@ -391,8 +416,8 @@ def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
     """
     exposures, balances = solved.logs @ EXPOSURE, solved.logs @ BALANCE
     exposure_error, balance_error = solved.error(EXPOSURE), solved.error(BALANCE)
-    kept = _part_beyond_chance(exposures, exposure_error, MODEL_ERROR, len(names) - 1)
-    kept_balance = _part_beyond_chance(balances, balance_error, 0.0, 2 * (len(names) - 1))
+    kept = _part_beyond_chance(exposures, exposure_error, solved.shared.exposure, len(names) - 1)
+    kept_balance = _part_beyond_chance(balances, balance_error, solved.shared.balance, 2 * (len(names) - 1))
     gains = np.exp(kept * exposures + kept_balance * balances)
     stops = exposures[:, 0] / np.log(2.0)
     return RigExposures(

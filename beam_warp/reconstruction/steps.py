@@ -28,9 +28,13 @@ from beam_warp.reconstruction.masks import mend_masks
 from beam_warp.reconstruction.photometry import find_exposures, may_compare
 from beam_warp.reconstruction.rig import refine_rig
 from beam_warp.reconstruction.track import Track, TrackOptions, advance_track, begin_track, outward_normals
-from beam_warp.reconstruction.unmasked import seen_in_common, unmasked_gaussians
+from beam_warp.reconstruction.unmasked import agreed_discs, seen_in_common, unmasked_gaussians
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
+
+COMPARED = 16_384
+"""Most points of the surface of photographs without masks at which exposures are compared; a quarter counts, the
+smoothest."""
 
 MOST_UNPAIRED = 0.5
 """Part of the Gaussians seen by fewer than two views above which there is a finding: most of the surface."""
@@ -104,11 +108,20 @@ class FitAndTrack:
     def find_exposures(
         self, names: Sequence[str], views: Sequence[CapturedView], progress: StepProgress
     ) -> RigExposures | None:
-        """Find exposures and white balances of a rig, from what its cameras show at one moment; None without light.
+        """Find exposures and white balances of a rig, from what its cameras show at one moment.
 
-        They are compared at a key frame's surface. It is kept: where nothing is undone, the frame begins with the same.
+        With masks and a known light, they are compared at a key frame's surface. It is kept: where nothing is undone,
+        the frame begins with the same. Without masks, they are compared where photographs agree on a surface.
         """
-        if self.environment is None or not may_compare(views):
+        if not may_compare(views):
+            return None
+        if views[0].alpha is None:
+            compared = min(COMPARED, self.fitting.gaussian_count)
+            surface = agreed_discs(views, compared, device=self.device, seed=self.fitting.seed)
+            if surface is None:
+                return None
+            return find_exposures(names, views, surface, surface.normals, self.environment, device=self.device)
+        if self.environment is None:
             return None
         begun = self.begin(views, progress)
         self._begun.append((views, begun))

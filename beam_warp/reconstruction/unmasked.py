@@ -19,7 +19,7 @@ from beam_warp.checks import require_count
 from beam_warp.image.color import LINEAR_REC709, linear_to_srgb
 from beam_warp.reconstruction.hull import viewing_focus
 from beam_warp.reconstruction.initial import DISC_OPACITY, even_surface_points, seen_colors, surface_discs
-from beam_warp.reconstruction.stereo import DEPTHS, agreed_surface, find_planes, reduction
+from beam_warp.reconstruction.stereo import DEPTHS, AgreedSurface, agreed_surface, find_planes, reduction
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
@@ -40,6 +40,10 @@ EDGE = 0.04
 LEAST_TIE = 1e-3
 """Difference of display colours at which neighbouring pixels are tied by 1/e, and how strongly all are at least: depth
 jumps where colours do."""
+
+FAR_TIE = 1e-3
+"""How strongly a pixel of unknown depth is tied to the farthest, beside 1 to a neighbour of its colour: some 30 pixels
+from the surface, the backdrop is more likely far behind than beside it, where other views would see it in between."""
 
 SEEN_THROUGH = 0.05
 """A disc is left out if another view shows the surface behind it, by more than this part of the depth."""
@@ -65,18 +69,12 @@ def unmasked_gaussians(
         InvalidOptionError: ``count`` or ``seed`` is out of range.
         DeviceError: The device is not there.
     """
-    require_count("count", count, 1, 2**26)
-    planes = find_planes(views, PIXELS_PER_DISC * count, device=device, seed=seed)
-    surface = agreed_surface(planes, device=device)
-    if surface is None:
+    found = _surface_in_common(views, count, device, seed)
+    if found is None:
         return None
-    mesh = surface.mesh
-    mesh.update_faces(seen_in_common(views, mesh.triangles_center))
-    if mesh.is_empty:
-        return None
-    cameras = [found.camera for found in planes]
+    surface, cameras = found
     others = _elsewhere(views, cameras, surface.depths, int(ELSEWHERE_SHARE * count), seed)
-    positions, normals, spacing = even_surface_points(mesh, count - len(others), device=device, seed=seed)
+    positions, normals, spacing = even_surface_points(surface.mesh, count - len(others), device=device, seed=seed)
     colors = seen_colors(views, surface_discs(positions, normals, spacing), device=device)
     known = np.column_stack(
         [positions, normals, np.full(len(positions), spacing), np.full(len(positions), DISC_OPACITY), colors]
@@ -89,6 +87,28 @@ def unmasked_gaussians(
     )
 
 
+def agreed_discs(
+    views: Sequence[CapturedView], count: int, *, device: str | None = None, seed: int = 0
+) -> GaussianCloud | None:
+    """Return discs spread evenly over the surface that photographs agree on; None if no two agree on anything.
+
+    Args:
+        views: Photographs of one moment, at least two. Coverage is not looked at.
+        count: Number of discs.
+        device: Warp device; the first GPU without, or the CPU where there is none.
+        seed: Same seed, same device, same result.
+
+    Raises:
+        InvalidArrayError: There are fewer than two views.
+        InvalidOptionError: ``count`` or ``seed`` is out of range.
+        DeviceError: The device is not there.
+    """
+    found = _surface_in_common(views, count, device, seed)
+    if found is None:
+        return None
+    return surface_discs(*even_surface_points(found[0].mesh, count, device=device, seed=seed))
+
+
 def seen_in_common(views: Sequence[CapturedView], points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Tell which points lie in as many images as a subject does, ``(N,)``: the others are backdrops of a few views."""
     counts = np.sum([seen_by(view.camera, points.astype(np.float64)) for view in views], axis=0)
@@ -99,26 +119,41 @@ def joined_depth(depth: NDArray[np.floating], colors: NDArray[np.floating], fart
     """Return an image of depth in which pixels without any take it from those around them.
 
     Inverse depth becomes harmonic: each pixel's is the mean of its neighbours', those of similar colour counting more.
-    Inverse depths of a plane are linear in the image, so that a plane is continued as a plane.
+    Inverse depths of a plane are linear in the image, so that a plane is continued as a plane. Far from all that is
+    known, depth goes to the farthest.
 
     Args:
         depth: Known depths [m], 0 where there is none, ``(H, W)``; at least one is known.
         colors: Display colours, ``(H, W, 3)``.
-        farthest: Largest depth that is given to a pixel [m].
+        farthest: Largest depth that is given to a pixel, and that of pixels far from known ones [m].
 
     Returns:
         Depths [m], ``(H, W)``; those known stay.
 
-    Source: Pérez et al. 2003 for the harmonic interpolation.
+    Source: Pérez et al. 2003 for the harmonic interpolation; the screened equation, Bhat et al. 2008.
     """
     known = (depth > 0.0).ravel()
     inverse = np.zeros(depth.size)
     inverse[known] = 1.0 / depth.ravel()[known]
     if not known.all():
         ties = _ties(colors)
-        system = (diags(np.asarray(ties.sum(axis=1)).ravel()) - ties).tocsr()[~known]
-        inverse[~known] = np.asarray(spsolve(system[:, ~known].tocsc(), -(system[:, known] @ inverse[known])))
+        system = (diags(np.asarray(ties.sum(axis=1)).ravel() + FAR_TIE) - ties).tocsr()[~known]
+        right = FAR_TIE / farthest - system[:, known] @ inverse[known]
+        inverse[~known] = np.asarray(spsolve(system[:, ~known].tocsc(), right))
     return 1.0 / np.maximum(inverse, 1.0 / farthest).reshape(depth.shape)
+
+
+def _surface_in_common(
+    views: Sequence[CapturedView], count: int, device: str | None, seed: int
+) -> tuple[AgreedSurface, list[Camera]] | None:
+    """Return the agreed surface without backdrops of a few views, and the cameras of its depths, if there is any."""
+    require_count("count", count, 1, 2**26)
+    planes = find_planes(views, PIXELS_PER_DISC * count, device=device, seed=seed)
+    surface = agreed_surface(planes, device=device)
+    if surface is None:
+        return None
+    surface.mesh.update_faces(seen_in_common(views, surface.mesh.triangles_center))
+    return None if surface.mesh.is_empty else (surface, [found.camera for found in planes])
 
 
 def _ties(colors: NDArray[np.floating]) -> csr_matrix:

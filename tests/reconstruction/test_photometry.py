@@ -13,7 +13,8 @@ from beam_warp.reconstruction import photometry
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.photometry import (
     LEVELS,
-    MODEL_ERROR,
+    MATTE_ERRORS,
+    MODEL_ERRORS,
     SolvedGains,
     find_exposures,
     highlights,
@@ -107,7 +108,7 @@ def test_sound_views_stay_to_the_bit(lit):
 def test_what_a_wrong_surface_shows_is_no_exposure(rng, size, is_undone):
     """Halves of the points agree on it, however many there are: only what is larger by far is undone, and all of it."""
     logs = drawn_gains(rng, 1.0, 0.0)
-    logs *= size * MODEL_ERROR / np.sqrt(np.mean(np.square(logs)))
+    logs *= size * MODEL_ERRORS.exposure / np.sqrt(np.mean(np.square(logs)))
     found = judged([str(view) for view in range(VIEWS)], SolvedGains(logs, np.zeros_like(logs), np.zeros_like(logs)))
     assert found.exposure_undone == is_undone
     np.testing.assert_allclose(np.log([camera.gains for camera in found.cameras]), is_undone * logs, atol=1e-12)
@@ -157,6 +158,18 @@ def test_a_view_that_shares_nothing_says_nothing(lit, rng):
     solved = solve_gains(seen(diffuse + shine, weights, np.zeros((VIEWS, 3))), gloss, AXIAL)
     np.testing.assert_array_equal(solved.logs[0], 0.0)
     assert solve_gains(seen(diffuse, 0.0 * weights, np.zeros((VIEWS, 3))), gloss, AXIAL) is None
+
+
+@pytest.mark.parametrize("size", [0.02, 0.25])
+def test_without_a_light_only_what_gloss_does_not_explain_is_undone(lit, rng, size):
+    diffuse, shine, weights, gloss = lit
+    logs = drawn_gains(rng, 1.0, 0.0)
+    logs *= size / np.sqrt(np.mean(np.square(logs)))
+    solved = solve_gains(seen(diffuse + 0.3 * shine, weights, logs), gloss[..., :0], AXIAL)
+    found = judged([str(view) for view in range(VIEWS)], solved)
+    assert found.exposure_undone == (size > MATTE_ERRORS.exposure)
+    assert not found.balance_undone
+    assert error_of(solved.logs, logs, MEAN) < MATTE_ERRORS.exposure
 
 
 @pytest.mark.parametrize("power", [0.0, 4.0])
