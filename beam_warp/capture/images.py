@@ -31,6 +31,10 @@ to be the same."""
 PLAIN_STOPS = 1.5
 """Replaces `EXPOSURE_STOPS` with fewer cameras, where light from one side and exposure cannot be told apart [stops]."""
 
+SPREADS = 3.0
+"""Cameras differ from what is expected if they do so by this many standard deviations of all, by the median: where light
+is hard, or faces are few, nothing that is linear expects well."""
+
 BLACK = 1e-4
 """An image is black if its brightest pixel is at most this share of the median image's brightest pixel."""
 
@@ -361,12 +365,14 @@ def _judge_exposure(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     levels = np.array([np.median(list(by_camera[name].values())) for name in names])
     fits = len(names) >= FIT_CAMERAS
     off = levels - _expected(levels, np.array([forward[name] for name in names]) if fits else None)
-    limit = EXPOSURE_STOPS if fits else PLAIN_STOPS
+    left = np.sort(np.abs(off))[4 if fits else 1 :]  # least absolute errors meet as many as there are unknowns exactly
+    spread = 1.4826 * float(np.median(left))
+    limit = max(EXPOSURE_STOPS if fits else PLAIN_STOPS, SPREADS * spread)
     wrong = {name: value for name, value in zip(names, off, strict=True) if abs(value) > limit}
     if wrong:
         findings.warn(
             "camera-exposure",
-            f"{count_of(len(wrong), 'camera')} {are(wrong)} more than {limit:g} stops from what the others "
+            f"{count_of(len(wrong), 'camera')} {are(wrong)} more than {limit:.1f} stops from what the others "
             "lead to expect",
             (f"{name} {value:+.1f}" for name, value in wrong.items()),
             "Match their exposure and white balance; a wrong camera pulls colours of all views.",

@@ -56,7 +56,8 @@ class BaseColor:
         base_color: In [0, 1], scene-linear Rec.709, ``(N, 3)`` float32.
         standard_error: ``(N, 3)`` float32.
         observability: `Observability` flags, ``(N,)`` uint8.
-        clipped_part: Part of the observed opacity with a channel cut at 1: a sign of light stated too dim.
+        clipped_part: Part of the observed opacity with a channel cut at 1 by more than its standard error: a sign of
+            light stated too dim.
     """
 
     base_color: NDArray[np.float32]
@@ -98,7 +99,7 @@ def solve_base_color(
     base_color = np.clip(raw, 0.0, 1.0)
     error = np.hypot(error * np.sqrt(dispersion), misfit_error(evidence))
     weight = np.where(missing, 0.0, cloud.opacities)
-    clipped = float((weight * (raw > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
+    clipped = float((weight * (raw - error > 1.0).any(axis=1)).sum() / max(weight.sum(), 1e-12))
     base_color, error = fill_from_neighbors(cloud.positions, base_color, error, missing)
     if missing.all():
         base_color, error = (np.full_like(base_color, value) for value in UNKNOWN)

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
-from scipy.special import fdtri, ndtri
+from scipy.special import chdtri, fdtri, ndtri
 
 from beam_warp.capture.exposures import CameraExposure, RigExposures
 from beam_warp.capture.views import CapturedView
@@ -80,10 +80,10 @@ class SharedErrors(NamedTuple):
     falloff: float
 
 
-MODEL_ERRORS = SharedErrors(0.015, 0.0, 0.15)
+MODEL_ERRORS = SharedErrors(0.015, 0.0, 0.5)
 """Where the light is known: cameras of walker, runner and robot, whose exposures are equal, seem to differ by 0.005,
-0.005 and 0.017. The power of walker and runner, whose cameras are pinholes, seems to be 0.00 and -0.02, or -0.12 on
-worse surfaces; robot's says nothing."""
+0.005 and 0.017. The power of their lenses, which are pinholes, seems to be 0.0 and 0.3; that of a round body that fills
+the image, so that outlines are farthest off the axis, 0.4, and 1.2 under a low sun."""
 
 MATTE_ERRORS = SharedErrors(0.06, 0.03, 0.3)
 """Where it is not, so that all looks matte: all cameras, or eight, of walker, runner and robot seem to differ by 0.02,
@@ -96,8 +96,12 @@ SMOOTHEST = 0.25
 """Part of the points that may be compared, those whose neighbours' normals agree most: where they do not, the surface
 is wrong, and so is the gloss that is expected of it."""
 
-FEWEST_POINTS = 64
-"""Fewest points that tell gains."""
+FEWEST_POINTS, LEAST_OF_VIEW = 64, 0.1
+"""Fewest points that tell gains, and the least part of those that the middle view sees which tell a view's: one that
+looks into the shadow may see three of the bright half, and nothing would hold its gain."""
+
+LARGEST_GAIN = 3.0
+"""Largest logarithm of a gain: nearer to 0 than 1/20, no step leads back."""
 
 LEAST_VIEWS, LEAST_MATTE_VIEWS = 4, 3
 """Views that a point is seen by at least where its gloss is looked for, and where it is not: two views could not tell
@@ -129,7 +133,7 @@ class SolvedGains:
 
     Attributes:
         logs: Of red, green and blue.
-        apart: Half the difference of what the bright and the dark half of the points tell.
+        apart: Half the difference of what the bright and the dark half of the points tell, over views that both know.
         gloss: Half of what the model of gloss changes.
         falloff: Power of the cosine that darkens images off the axis.
         falloff_error: Its standard error.
@@ -305,6 +309,7 @@ def solve_gains(
     levels = means[rows] @ LUMINANCE
     is_bright = levels > np.median(levels)
     all_of_them = np.ones(len(rows), bool)
+    told = np.logical_and(*(_tell(seen[half]) for half in (is_bright, ~is_bright)))
     asked = ((all_of_them, shine), (all_of_them, shine[..., :0]), (is_bright, shine), (~is_bright, shine))
     with ThreadPoolExecutor(len(asked)) as pool:
         every, matte, bright, dark = pool.map(
@@ -312,12 +317,23 @@ def solve_gains(
         )
     apart, of_gloss = (0.5 * (one - other) for one, other in ((bright, dark), (every, matte)))
     views = len(samples)
+    if not told.any():
+        return None
+    logs, apart_logs, gloss_logs = (numbers[:-1].reshape(views, 3) for numbers in (every, apart, of_gloss))
     return SolvedGains(
-        *(logs[:-1].reshape(views, 3) for logs in (every, apart, of_gloss)),
+        logs,
+        np.where(told[:, None], apart_logs, 0.0) * np.sqrt(views / told.sum()),
+        gloss_logs,
         falloff=float(every[-1]),
         falloff_error=float(np.hypot(apart[-1], of_gloss[-1])),
         shared=MATTE_ERRORS if is_matte else MODEL_ERRORS,
     )
+
+
+def _tell(weights: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which views see enough points to have gains, of weights of points in views, ``(N, V)``."""
+    counts = (weights > 0.0).sum(axis=0)
+    return counts >= max(1.0, LEAST_OF_VIEW * float(np.median(counts)))
 
 
 class _Solver:
@@ -332,6 +348,7 @@ class _Solver:
     ) -> None:
         count, views, _, kinds = gloss.shape
         self._colors = colors.reshape(count, -1)
+        weights = np.where(_tell(weights), weights, 0.0)
         self._weights = np.repeat(weights, 3, axis=1)
         own = np.broadcast_to(np.tile(np.eye(3), views), (count, 3, 3 * views))
         self._basis = np.concatenate([own, gloss.reshape(count, 3 * views, kinds).transpose(0, 2, 1)], axis=1)
@@ -356,6 +373,7 @@ class _Solver:
             matrix, right = self._round()
             change = self._step(matrix, right, moved)
             self._logs[self._known[:-1]] += change[: len(self._known) - 1]
+            self._logs = np.clip(self._logs, -LARGEST_GAIN, LARGEST_GAIN)
             self._falloff += change[-1] if vignetting else 0.0
             if np.abs(change).max(initial=0.0) < SETTLED:
                 break
@@ -438,9 +456,11 @@ def judged(names: Sequence[str], solved: SolvedGains) -> RigExposures:
 def _part_beyond_chance(found: NDArray[np.float64], error: float, shared: float, freedom: int) -> float:
     """Return the part of what was found that an error does not explain.
 
-    It is 0 unless an F test says that the error, with what halves of the points share, is not all.
+    It is 0 unless tests say that the error, with what halves of the points share, is not all: an F test of the error,
+    which is known from as many numbers, a chi-square test of what is shared.
     """
     signal = float(np.mean(np.square(found)))
-    if not signal > (error**2 + shared**2) / fdtri(freedom, freedom, CHANCE):  # F's upper quantile, of equal freedoms
+    chance = error**2 / fdtri(freedom, freedom, CHANCE)  # F's upper quantile, of equal freedoms
+    if not signal > chance + shared**2 * chdtri(freedom, CHANCE) / freedom:
         return 0.0
     return 1.0 - error**2 / signal

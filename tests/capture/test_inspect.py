@@ -110,6 +110,15 @@ def test_faults_of_images(tmp_path, change, pattern, code, severity):
         assert require_reconstructable(Capture.read(tmp_path)).fallbacks[0].code == code
 
 
+def test_hard_light_accuses_no_camera(tmp_path):
+    """A pillar in the sun shows four faces in turn, which differ by up to 1.8 stops: no camera is wrong."""
+    write_sound(tmp_path, rig(16))
+    for number in range(16):
+        for path in (tmp_path / f"images/c{number:02d}").iterdir():
+            rewrite(path, changed(COLOR, lambda color, stops=0.6 * (number % 4): color * 2.0 ** (-stops / 2.2)))
+    assert found(tmp_path) == {}
+
+
 def test_a_black_camera_is_left_out_in_all_its_frames(tmp_path):
     write_sound(tmp_path)
     for path in (tmp_path / "images/c03").iterdir():

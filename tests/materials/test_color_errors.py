@@ -91,6 +91,13 @@ class TestStandardError:
 
 
 class TestFlags:
+    def test_only_what_errors_do_not_explain_is_called_cut(self, rng):
+        """A base colour of 0.95 that is known to 0.05 is above 1 one time in six, and one of 1.2 always is."""
+        for color, least, most in ((0.95, 0.0, 0.1), (1.2, 0.98, 1.0)):
+            noisy = color + 0.05 * np.sqrt(16) * rng.normal(size=(16, 400, 1)) * np.ones(3)
+            solved = solve_base_color(bare(400), evidence(noisy), IRRADIANCE)
+            assert least <= solved.clipped_part <= most
+
     def test_what_one_frame_of_many_shows_is_measured(self):
         total = evidence(np.full((4, 10, 3), 0.4), noise=0.1)
         for _ in range(150):

@@ -160,6 +160,21 @@ def test_a_view_that_shares_nothing_says_nothing(lit, rng):
     assert solve_gains(seen(diffuse, 0.0 * weights, np.zeros((VIEWS, 3))), gloss, AXIAL) is None
 
 
+def test_a_view_that_sees_next_to_nothing_has_no_gain(lit, rng):
+    """Three points in the shadow would drive its gain to 0, where all that is known of it vanishes."""
+    diffuse, shine, weights, gloss = lit
+    weights = weights * (np.arange(VIEWS)[:, None] > 0)
+    expected = solve_gains(seen(diffuse + shine, weights, np.zeros((VIEWS, 3))), gloss, AXIAL)
+    few = np.argsort(-diffuse.sum(axis=1))[:3]
+    weights[0, few] = 1.0
+    colors = seen(diffuse + shine, weights, np.zeros((VIEWS, 3)))
+    colors[0, few, :3] *= rng.uniform(1e-4, 1e-2, (3, 3))
+    solved = solve_gains(colors, gloss, AXIAL)
+    np.testing.assert_array_equal(solved.logs[0], 0.0)
+    np.testing.assert_allclose(solved.logs, expected.logs, atol=1e-3)
+    assert solved.error(np.eye(3)) < 2.0 * expected.error(np.eye(3)) < 0.1
+
+
 @pytest.mark.parametrize("size", [0.02, 0.25])
 def test_without_a_light_only_what_gloss_does_not_explain_is_undone(lit, rng, size):
     diffuse, shine, weights, gloss = lit
