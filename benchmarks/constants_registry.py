@@ -374,14 +374,22 @@ MATERIALS = (
             ("DARKEST", "Colour of points that are left out, of the median."),
             ("LEAST_CHANCE", "Least probability of a roughness."),
             ("LEAST_SPREAD", "Least standard deviation of a colour."),
-            ("MODEL_ERROR", "Error of exposures that halves of the points share [logarithm]."),
-            ("FALLOFF_ERROR", "Error of the power of vignetting that halves of the points share."),
+            ("MODEL_ERRORS.exposure", "Error of exposures that halves of the points share [logarithm]."),
+            ("MODEL_ERRORS.balance", "Error of white balances that they share [logarithm]."),
+            ("MODEL_ERRORS.falloff", "Error of the power of vignetting that they share."),
+            ("MATTE_ERRORS.exposure", "The same where the light is not known [logarithm]."),
+            ("MATTE_ERRORS.balance", "The same of white balances [logarithm]."),
+            ("MATTE_ERRORS.falloff", "The same of vignetting."),
+            ("LEAST_MATTE_VIEWS", "Views that a point is seen by at least, where the light is not known."),
+            ("LEAST_OF_VIEW", "Points that tell a view's gains, over those that the middle view sees."),
+            ("LARGEST_GAIN", "Largest gain [logarithm]."),
         )
     ),
     *(
         Constant(f"beam_warp.{place}", "photographs of a statue", does, MASKED)
         for place, does in (
             ("reconstruction.steps:PLENTY", "Photographs from which on all Gaussians and steps are spent."),
+            ("reconstruction.steps:COMPARED", "Points at which exposures are compared."),
             ("reconstruction.stereo:ROUNDS", "Times that pixels improve their planes at a level."),
             ("reconstruction.stereo:AGREEMENTS", "Times that views look at each other's depths."),
             ("reconstruction.stereo:MOST_NEIGHBORS", "Views that a view is compared with."),
@@ -396,6 +404,7 @@ MATERIALS = (
             ("reconstruction.unmasked:ELSEWHERE_OPACITY", "Opacity of discs whose depth is not known."),
             ("reconstruction.unmasked:EDGE", "Difference of colours across which depth may jump."),
             ("reconstruction.unmasked:LEAST_TIE", "Least tie of neighbouring pixels."),
+            ("reconstruction.unmasked:FAR_TIE", "Tie of pixels of unknown depth to the farthest."),
             ("reconstruction.unmasked:SEEN_THROUGH", "Part of the depth by which a disc is in front."),
             ("kernels.reconstruction.patch_match:REACH", "Half the side of a patch [pixel]."),
             ("kernels.reconstruction.patch_match:SPREAD", "Distance at which a sample counts 1/e [pixel]."),
@@ -409,7 +418,8 @@ MATERIALS = (
     *(
         Constant(f"beam_warp.reconstruction.rig:{name}", ALL, does, EXACT_RIGS)
         for name, does in (
-            ("CERTAIN", "Corrections of a rig that are made [standard error]."),
+            ("CERTAIN", "Turns of a rig that are made [standard error]."),
+            ("CERTAIN_BESIDE", "Other corrections that are made beside turns [standard error]."),
             ("LEAST_DISTORTION", "Distortion of lenses that is told [pixel]."),
             ("CERTAIN_ALONE", "Those of one camera alone [standard error]."),
             ("MOST_BEHIND", "How much worse a camera that is left out is met [dB]."),

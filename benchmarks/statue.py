@@ -126,7 +126,10 @@ def left_out(
 def sheet(pairs: list[NDArray[np.float64]]) -> NDArray[np.uint8]:
     """Return photographs and drawings, three pairs in a row."""
     step = max(1, pairs[0].shape[1] // (2 * SHOWN))
-    small = [np.stack([block_means(pair[..., k], step) for k in range(3)], axis=-1) for pair in pairs]
+    fitting = (pairs[0].shape[0] // step * step, pairs[0].shape[1] // step * step)
+    small = [
+        np.stack([block_means(pair[: fitting[0], : fitting[1], k], step) for k in range(3)], axis=-1) for pair in pairs
+    ]
     rows = [np.concatenate(small[first : first + ACROSS], axis=1) for first in range(0, len(small), ACROSS)]
     return np.rint(255.0 * np.concatenate(rows)).astype(np.uint8)
 
@@ -145,7 +148,7 @@ def main() -> int:
     fitting = FitOptions.of_preset(arguments.preset, gaussian_count=arguments.gaussians)
     steps = FitAndTrack(fitting=fitting, device=arguments.device)
     rows, pairs = [], []
-    for index, held in enumerate(records):
+    for index in range(len(records)):
         row, pair = left_out(records, index, steps, arguments.reduction)
         rows.append(row)
         print(row, file=sys.stderr, flush=True)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import materials_plot
+from record import PICTURES
 from tables import Row, Rows, cell, figure, number, table
 
 MAIN = "reconstruction_h200.json"
@@ -267,7 +269,7 @@ def statue(result: Row) -> Rows:
 @figure("statue.webp", STATUE)
 def draw_statue(_: Row, path: Path) -> None:
     """Show each photograph that was left out beside what the others show."""
-    draw_sheet(PICTURES / "statue.png", path)
+    materials_plot.draw_sheet(PICTURES / "statue.png", path)
 
 
 @figure("reconstruction.webp", MAIN, CHOICES)

@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,8 @@ CHANCE = 1e-3
 """Probability below which differences of gains are not chance."""
 
 
-class SharedErrors(NamedTuple):
+@dataclass(frozen=True)
+class SharedErrors:
     """Errors that halves of the points share, because the surface or what is known of its gloss is wrong.
 
     Attributes:

@@ -53,9 +53,10 @@ FEWEST_CAMERAS = 8
 """Fewest cameras of a rig: of fewer, one or two see most of the surface, and another shape explains their errors.
 Inspection warns of the same number."""
 
-CERTAIN = 1.5
-"""Corrections that are so many times their standard errors, root mean square over the rig, are made. In exact rigs that
-is about 1, by what the errors are."""
+CERTAIN, CERTAIN_BESIDE = 1.5, 2.0
+"""Turns that are so many times their standard errors, root mean square over the rig, are made, and what explains more
+beside turns. In exact rigs that is about 1, by what the errors are; one of three kinds is easily above. The focal
+lengths of a shrine with a polished ball at night, whose highlights move with the camera, were 1.54."""
 
 CERTAIN_ALONE = 6.0
 """Those of one camera alone are made from here on."""
@@ -410,13 +411,13 @@ def wrong_kinds(found: Sequence[Evidence], known: Sequence[str] = ()) -> tuple[s
         return (first,)
     base = tuple(known) or (first,)
     sizes = {kind: strength(found, [*base, kind], kind) for kind in others if kind not in base}
-    certain = {kind: root_mean_square(size) for kind, size in sizes.items() if is_certain(size)}
+    certain = {kind: root_mean_square(size) for kind, size in sizes.items() if is_certain(size, CERTAIN_BESIDE)}
     return (*base, max(certain, key=lambda kind: certain[kind])) if certain else tuple(known)
 
 
-def is_certain(strengths: NDArray[np.float64]) -> bool:
+def is_certain(strengths: NDArray[np.float64], least: float = CERTAIN) -> bool:
     """Tell whether corrections that are so many standard errors are beyond doubt, together or one alone."""
-    return bool(root_mean_square(strengths) > CERTAIN or strengths.max() > CERTAIN_ALONE)
+    return bool(root_mean_square(strengths) > least or strengths.max() > CERTAIN_ALONE)
 
 
 def _corner(view: CapturedView, part: CapturedView) -> tuple[int, int]:
