@@ -31,9 +31,9 @@ to be the same."""
 PLAIN_STOPS = 1.5
 """Replaces `EXPOSURE_STOPS` with fewer cameras, where light from one side and exposure cannot be told apart [stops]."""
 
-SPREADS = 3.0
-"""Cameras differ from what is expected if they do so by this many standard deviations of all, by the median: where light
-is hard, or faces are few, nothing that is linear expects well."""
+SPREADS = 4.0
+"""Cameras differ from what is expected if they do so by this many standard deviations of all, by the median: where
+light is hard, or faces are few, nothing that is linear expects well."""
 
 BLACK = 1e-4
 """An image is black if its brightest pixel is at most this share of the median image's brightest pixel."""
