@@ -120,7 +120,7 @@ class FitAndTrack:
             surface = agreed_discs(views, compared, device=self.device, seed=self.fitting.seed)
             if surface is None:
                 return None
-            return find_exposures(names, views, surface, surface.normals, self.environment, device=self.device)
+            return find_exposures(names, views, surface, _faces(surface), self.environment, device=self.device)
         if self.environment is None:
             return None
         begun = self.begin(views, progress)
@@ -140,8 +140,7 @@ class FitAndTrack:
         fitting = _borne(self.fitting, len(views)) if is_bare else self.fitting
         start, findings, said = self._start(views, fitting.gaussian_count), [], {}
         if all(view.alpha is not None for view in views):  # else it is no surface, and does not say who sees what
-            up = Rotation.from_quat(start.orientations).apply([0.0, 0.0, 1.0])  # outward, of discs on a hull
-            gains = view_gains(start, outward_normals(start, up), views, device=self.device)
+            gains = view_gains(start, outward_normals(start, _faces(start)), views, device=self.device)
             findings = judge_gains(gains, views)
             if findings:
                 views = matched(views, gains)
@@ -221,6 +220,11 @@ class FitAndTrack:
     def restore(self, arrays: dict[str, NDArray[np.generic]]) -> Track:
         """Return the track whose arrays these are."""
         return Track.from_arrays(arrays)
+
+
+def _faces(discs: GaussianCloud) -> NDArray[np.float64]:
+    """Return which way discs of a start face, ``(N, 3)``: outward, for they lie on a surface."""
+    return Rotation.from_quat(discs.orientations).apply([0.0, 0.0, 1.0])
 
 
 def _borne(options: FitOptions, view_count: int) -> FitOptions:
