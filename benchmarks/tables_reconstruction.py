@@ -248,7 +248,7 @@ def exposures(result: Row) -> Rows:
 @table("statue", STATUE)
 def statue(result: Row) -> Rows:
     """Return how far each photograph is met that was left out."""
-    head = ["left out", "PSNR [dB]", "matched [dB]", "red, green, blue", "covered", "exposures matched", "seconds"]
+    head = ["left out", "PSNR [dB]", "matched [dB]", "red, green, blue", "covered", "exposures matched"]
     return [
         head,
         *(
@@ -259,7 +259,6 @@ def statue(result: Row) -> Rows:
                 ", ".join(f"{gain:.2f}" for gain in row["gains"]),
                 f"{100.0 * row['covered']:.0f} %",
                 "yes" if row["matched_cameras"] else "no",
-                f"{row['seconds']:.1f}",
             ]
             for row in result["rows"]
         ),
