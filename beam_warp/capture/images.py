@@ -365,7 +365,7 @@ def _judge_exposure(glimpses: Sequence[Glimpse], findings: Findings) -> None:
     levels = np.array([np.median(list(by_camera[name].values())) for name in names])
     fits = len(names) >= FIT_CAMERAS
     off = levels - _expected(levels, np.array([forward[name] for name in names]) if fits else None)
-    left = np.sort(np.abs(off))[4 if fits else 1 :]  # least absolute errors meet as many as there are unknowns exactly
+    left = np.sort(np.abs(off))[4 if fits else 0 :]  # four lie on a plane of least absolute errors
     spread = 1.4826 * float(np.median(left))
     limit = max(EXPOSURE_STOPS if fits else PLAIN_STOPS, SPREADS * spread)
     wrong = {name: value for name, value in zip(names, off, strict=True) if abs(value) > limit}

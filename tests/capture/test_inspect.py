@@ -119,6 +119,13 @@ def test_hard_light_accuses_no_camera(tmp_path):
     assert found(tmp_path) == {}
 
 
+def test_one_of_three_cameras_is_named(tmp_path):
+    write_sound(tmp_path, rig(3))
+    for path in (tmp_path / "images/c01").iterdir():
+        rewrite(path, darken)
+    assert "c01" in found(tmp_path)["camera-exposure"].where
+
+
 def test_a_black_camera_is_left_out_in_all_its_frames(tmp_path):
     write_sound(tmp_path)
     for path in (tmp_path / "images/c03").iterdir():

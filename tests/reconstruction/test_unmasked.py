@@ -49,7 +49,7 @@ class TestJoinedDepth:
         np.testing.assert_allclose(joined_depth(depth, np.zeros((4, 4, 3)), 5.0), 5.0)
 
     def test_far_from_the_surface_is_the_backdrop(self):
-        """In a row of one colour, what inverse depths differ by from the farthest falls by one factor a pixel."""
+        """Inverse depths in a row of one colour come nearer to the farthest by one factor a pixel."""
         depth = np.zeros((3, 400))
         depth[:, 0] = 2.0
         off = 1.0 / joined_depth(depth, np.full((3, 400, 3), 0.5), 50.0)[1] - 1.0 / 50.0
