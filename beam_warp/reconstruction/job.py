@@ -466,6 +466,10 @@ class ReconstructionWork:
     def _findings(self) -> list[Finding]:
         """Return what a user should know about the capture."""
         said = list(self.frames.findings)
+        exposures = self.found.get("exposures")
+        if isinstance(exposures, RigExposures) and not exposures.exposure_undone:
+            # What cameras show of the same points outranks what inspection makes of the brightness of whole images.
+            said = [finding for finding in said if finding.code != "camera-exposure"]
         for mend in MENDS:
             if mend.stage in self.found:
                 said += self.found[mend.stage].findings()

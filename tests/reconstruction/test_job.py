@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 import weakref
 from dataclasses import replace
@@ -258,11 +259,12 @@ class TestResuming:
     def test_a_kill_at_any_write_changes_no_byte(self, capture, tmp_path, monkeypatch):
         """A kill before a write leaves what the writes before it made; the last leaves a whole run."""
         options = ReconstructOptions(segment_length=2, frames=(0, 1, 2))
-        left = []
+        left, one_at_a_time = [], threading.Lock()  # writes of two threads may meet
 
         def keep_what_a_kill_leaves():
             unfinished = shutil.ignore_patterns("*.tmp")  # of the thread that reads ahead; others are left below
-            left.append(shutil.copytree(tmp_path / "whole", tmp_path / f"killed_{len(left)}", ignore=unfinished))
+            with one_at_a_time:
+                left.append(shutil.copytree(tmp_path / "whole", tmp_path / f"killed_{len(left)}", ignore=unfinished))
 
         with monkeypatch.context() as patch:
             before_each_write(patch, keep_what_a_kill_leaves)
@@ -508,6 +510,23 @@ class TestExposures:
         kept = reconstruct(capture, tmp_path / "out", steps, replace(BEGINNING, exposures="keep"))
         assert kept.capture is capture
         assert RigExposures.read(tmp_path / "out") is None
+
+    def test_what_shared_points_say_outranks_the_brightness_of_images(self, tmp_path):
+        """A camera that sees a face in the sun is bright; the points that it shares say that its exposure is right."""
+        folder = write_capture(tmp_path / "ball", FRAMES[:1])
+        (bright,) = (record for record in Capture.read(folder).records if record.camera_name == "c1")
+        view = bright.view()
+        colors = 5.0 * np.moveaxis(view.color, -1, 0) * view.alpha
+        write_exr(folder / "images/c1/0000.exr", dict(zip("RGBA", [*colors, view.alpha], strict=True)))
+
+        def codes(exposures):
+            steps = FakeSteps()
+            steps.exposures = exposures
+            found = reconstruct(Capture.read(folder), tmp_path / f"out_{exposures is None}", steps)
+            return {finding["code"] for finding in found.report["findings"]}
+
+        assert "camera-exposure" in codes(None)
+        assert "camera-exposure" not in codes(RigExposures(tuple(map(CameraExposure, ("c0", "c1", "c2")))))
 
 
 def down_of(camera):
