@@ -4,8 +4,10 @@ A clip must be written in the precision that is safe for the whole sequence, and
 of each clip are surveyed first, as soon as they are made; the surveys are added up; and then the clips are written, in
 any order. Where all frames may have the same Gaussians, a survey also says which quaternions change their sign from the
 first frame of a clip to that of the next one, since signs are kept along the sequence. The result has the same bytes as
-`beam_warp.converters.write` of the whole sequence. OpenUSD is loaded by the steps alone: whoever hands them out, and
-workers that do others, start without it.
+`beam_warp.converters.write` of the whole sequence.
+
+OpenUSD is loaded with this module, before a job begins any thread. Its libraries give Python up and take it back while
+the system loads them; a thread that has Python by then and needs the system's loader waits for them, and they for it.
 """
 
 from __future__ import annotations
@@ -16,21 +18,22 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, reduce
 from operator import add
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.converters import usd
 from beam_warp.converters.common.options import WriteOptions
 from beam_warp.digests import code_digest
 from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.outputs import replacing
 from beam_warp.plan.steps import Plan, Rank, Step, Task
+from beam_warp.schema.authoring import turned_signs
 from beam_warp.schema.clips import CLIP_FRAMES, MAX_FRAMES_IN_ONE_LAYER, clip_name
+from beam_warp.schema.survey import FramesSurvey, Survey
+from beam_warp.schema.writer import WrittenClips, write_clip
 from beam_warp.world.gaussians import GaussianSequence
-
-if TYPE_CHECKING:
-    from beam_warp.schema.survey import Survey
 
 FOLDER = "clips"
 """Folder of the clips, in that of the asset; the asset's own are second names of the same files."""
@@ -85,9 +88,6 @@ class ClipWork:
             path: Root layer.
             said: Facts of the steps, by name; those of other steps do not matter.
         """
-        from beam_warp.converters import usd
-        from beam_warp.schema.writer import WrittenClips
-
         known = said.get(self._whole)
         clips = None if known is None else WrittenClips(_survey_of(known["survey"]), self.folder / FOLDER)
         return usd.write(sequence, path, self.options, clips)
@@ -115,8 +115,6 @@ class ClipWork:
 
     @cached_property
     def _sequence(self) -> GaussianSequence:
-        from beam_warp.converters import usd
-
         return usd.prepared(self._given)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -146,9 +144,6 @@ class ClipWork:
 
     def _look_at(self, step: Step) -> Mapping[str, Any]:
         """Survey the frames of a clip; write which signs turn until the next one, while rows are the same Gaussians."""
-        from beam_warp.schema.authoring import turned_signs
-        from beam_warp.schema.survey import FramesSurvey
-
         start, found, before, turned = _start(step), list[FramesSurvey](), None, None
         are_same = self._may_be_constant
         for frame in range(len(self._given))[start : start + CLIP_FRAMES + are_same]:
@@ -164,8 +159,6 @@ class ClipWork:
 
     def _add_up(self, task: Task) -> Mapping[str, Any]:
         """Add surveys up; if the topology is constant, write which signs are turned where each clip begins."""
-        from beam_warp.schema.survey import FramesSurvey, Survey
-
         found = reduce(add, (FramesSurvey(**{**said, "counts": tuple(said["counts"])}) for said in task.facts))
         sequence = self._of_topology(self._may_be_constant and found.digests.get("ids", "") != "")
         survey = asdict(Survey.of(found, sequence))
@@ -177,8 +170,6 @@ class ClipWork:
         return {"survey": plain, "is_constant": sequence.topology == "constant"}
 
     def _write(self, task: Task) -> Mapping[str, Any]:
-        from beam_warp.schema.writer import write_clip
-
         survey, start, turned = _survey_of(task.facts[0]["survey"]), _start(task.step), None
         if task.facts[0]["is_constant"]:
             turned = _loaded(self.folder / FOLDER / f"{self._whole}.npy", start // CLIP_FRAMES)
@@ -224,7 +215,5 @@ def _start(step: Step) -> int:
 
 def _survey_of(facts: Mapping[str, Any]) -> Survey:
     """Return a survey that a receipt holds."""
-    from beam_warp.schema.survey import Survey
-
     kinds = {"counts": tuple, "names": tuple, "varying": frozenset, "half": frozenset}
     return Survey(**{name: kinds.get(name, lambda it: it)(value) for name, value in facts.items()})

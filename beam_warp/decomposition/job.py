@@ -38,6 +38,7 @@ from beam_warp.plan.carry import Counted, carry_out
 from beam_warp.plan.steps import Plan, Receipt
 from beam_warp.plan.workers import Crew, in_process
 from beam_warp.reconstruction.job import Reconstruction, ReconstructionWork
+from beam_warp.schema.staging import publish_asset, staged_folder
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -211,8 +212,6 @@ def _finish(
     work: MaterialWork, receipts: Mapping[str, Receipt], notes: list[str], overview: OverviewOptions, started: float
 ) -> RunResult:
     """Write asset, contact sheet and report."""
-    from beam_warp.schema.staging import publish_asset, staged_folder  # with OpenUSD, which nothing before needs
-
     source = replace(work.source, sequence=work.whole)
     plan, out, log = replace(work.job, source=source), work.folder, source.log
     made = Measurements.of(receipts, work.frames.numbers())

@@ -195,7 +195,7 @@ class ReconstructionWork:
         notes: What a killed call had left half written, and was removed.
     """
 
-    later = ("trimesh", "beam_warp.converters.usd")  # of previews, of the asset
+    later = ("trimesh",)  # of previews
     capture: Capture
     folder: Path
     steps: FrameSteps
