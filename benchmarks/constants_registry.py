@@ -24,6 +24,7 @@ LAMPS = "only lamps use it; relit views have none"
 EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 MASKED = "these captures have masks; it counts only for photographs without"
 EXACT_EXPOSURES = "exposures of these captures are equal, and colours stay as they are"
+CLEAN_PHOTOGRAPHS = "photographs of these captures are clean, and steps leave out no Gaussians"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 SCENE_LINEAR = "the captures are scene-linear, so that no exposure is looked for"
 FAR_MOTION = "only motion beyond the reach of reduced images uses it, which these frames do not have"
@@ -214,6 +215,15 @@ TRACKING = (
     Constant("beam_warp.reconstruction.joints.skinning:Anchors.fit(neighbor_count)", BOTH, "Joints of a Gaussian."),
     Constant("beam_warp.reconstruction.joints.selection:OVERSAMPLING", BOTH, "Candidates for a joint."),
     Constant("beam_warp.reconstruction.joints.selection:NEIGHBORS", JUDGED, "Neighbours of one that is not astray."),
+    *(
+        Constant(f"beam_warp.reconstruction.fit:{name}", ALL, does, CLEAN_PHOTOGRAPHS)
+        for name, does in (
+            ("DROPOUT_OF_NOISE", "Part that a step leaves out, over noise and what a pixel has too many."),
+            ("NEEDED", "Gaussians that a pixel of the subject needs."),
+            ("LEAST_DROPOUT", "Part below which none is left out."),
+            ("MOST_DROPOUT", "Largest part that is left out."),
+        )
+    ),
     Constant(TRACK + "TrackOptions.reach", WALKER, "Pixels from which on silhouettes are asked.", FAR_MOTION),
     Constant(FAR + "MOST_NODES " + FAR + "POINTS_PER_NODE", WALKER, "Points of either surface.", FAR_MOTION),
     Constant(FAR + "HULL_RESOLUTION", JUDGED, "Voxels of the hull that joints are moved to.", FAR_MOTION),
@@ -587,7 +597,7 @@ UNTUNED = {
         FitOptions: raster.near temporal
         TrackOptions: joints.weights.normal
         TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
-        TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every
+        TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every refinement.dropout
         TrackOptions: refinement.refine_until refinement.split_fraction refinement.hidden_share refinement.dead_opacity
         BakeOptions: passes ridge temporal low high""",
     "limits of memory, time and floating point, and sizes of blocks": """

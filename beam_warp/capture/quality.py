@@ -132,10 +132,10 @@ def quality_of(record: CaptureRecord, view: CapturedView) -> ImageQuality:
     loss = 0.0 if is_film(record.image_path) else quantization_error(record.image_path)
     if view.alpha is None:
         solid = np.ones(view.color.shape[:2], bool)
-        return ImageQuality((np.nan, np.nan), _relative_noise(view.color, solid), loss, by_coverage=False)
+        return ImageQuality((np.nan, np.nan), relative_noise(view.color, solid), loss, by_coverage=False)
     is_photograph = view.mask_offset is not None or record.mask_path is not None or record.plate_path is not None
     shown = record.image().linear_rgba()[..., :3] if is_photograph else view.alpha[..., None]
-    blur, noise = edge_blur(shown, view.alpha), _relative_noise(view.color, view.alpha > WHOLE)
+    blur, noise = edge_blur(shown, view.alpha), relative_noise(view.color, view.alpha > WHOLE)
     blots = blotted(shown, view.alpha) if is_photograph else 0
     return ImageQuality(blur, noise, loss, by_coverage=not is_photograph, blots=blots)
 
@@ -295,8 +295,16 @@ def photon_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
     return float(np.quantile(least, QUARTILE) / LEAST_OVER_VARIANCE)
 
 
-def _relative_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
-    """Return the standard deviation of a channel over its value, in the middle of the subject's levels."""
+def relative_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
+    """Return the standard deviation of a pixel's colour channel over its value, in the middle of the subject's levels.
+
+    Args:
+        color: Scene-linear, ``(H, W, 3)``.
+        solid: Which pixels show the subject alone, ``(H, W)``.
+
+    Returns:
+        A part of the value; NaN as for `photon_noise`.
+    """
     level = float(np.median(color[solid])) if solid.any() else 0.0
     return float(np.sqrt(np.maximum(photon_noise(color, solid), 0.0) / level)) if level > 0.0 else np.nan
 

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from beam_warp.capture.quality import WHOLE, relative_noise
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
@@ -61,6 +62,19 @@ LEAST_GAIN = 0.15
 
 FEWEST_GAUSSIANS = 2_000
 """Fewest Gaussians with which a fit to a target PSNR begins."""
+
+DROPOUT_OF_NOISE = 2.0
+"""Part of the Gaussians that a step leaves out, over the variance of the photographs' noise and the number of Gaussians
+that a pixel of the subject has beyond `NEEDED`. Dropout acts like a ridge (Wager et al. 2013), whose weight is to be as
+the noise's variance."""
+
+NEEDED = 2.0
+"""Gaussians for a pixel of the subject: one before, one behind. Where there are no more, none can stand in for another,
+and what is left out is missed."""
+
+LEAST_DROPOUT, MOST_DROPOUT = 0.005, 0.2
+"""Below the first, nothing is left out, and fits to clean photographs keep their bits. Above the second, what is left
+covers the subject no more."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +133,8 @@ class FitOptions:
         hidden_share: A refinement drops the Gaussians that show least, which together hold this part of the weights of
             all: about a third of all Gaussians, which sank behind others and which no gradient pulls back.
         dead_opacity: Gaussians below it are dropped.
+        dropout: Part of the Gaussians that a step leaves out, others each time, so that none of them learns the noise
+            of a photograph; ``"auto"``: as the photographs' noise asks for, see `chosen_dropout`.
         seed: Same seed, same device, same result.
 
     Raises:
@@ -141,6 +157,7 @@ class FitOptions:
     split_fraction: float = 0.2
     hidden_share: float = 0.01
     dead_opacity: float = 0.02
+    dropout: float | Literal["auto"] = "auto"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -156,12 +173,15 @@ class FitOptions:
         for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
             require_number(name, getattr(self, name), 0.0, 1.0)
         require_number("temporal", self.temporal, 0.0)
+        if self.dropout != "auto":
+            require_number("dropout", self.dropout, 0.0, MOST_DROPOUT)
 
     @classmethod
     def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
         """Return the options of a preset, some of them changed.
 
-        ``fast`` is ours, ``draft`` a seventh of its steps, larger ones: for a first look, and for a CPU. ``paper`` is
+        ``fast`` is ours, ``draft`` a seventh of its steps, larger ones: for a first look, and for a CPU. They are too
+        few to learn noise, so nothing is left out of them. ``paper`` is
         BEAM's schedule: 7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term
         of coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter,
         normals at 0.05 for the second half. The latter two draw one sample a pixel.
@@ -171,7 +191,7 @@ class FitOptions:
         """
         require_choice("preset", preset, PRESETS)
         rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
-        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
+        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05, "dropout": 0.0}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
             "draft": {
@@ -179,6 +199,7 @@ class FitOptions:
                 "normal_iterations": 300,
                 "refine_every": 100,
                 "rates": LearningRates(positions=8e-4, scales=2e-2, opacities=6e-2, bands=1e-3, final_others=1.0),
+                "dropout": 0.0,
             },
             "paper": {
                 **common,
@@ -207,8 +228,8 @@ class Fit:
 
     Attributes:
         cloud: Gaussians with scene-linear radiance and ids.
-        report: JSON-able record: ``psnr`` of the training views' crops [dB], lowest
-            ``view_psnr``, ``gaussians``, ``iterations``, ``samples``, ``seconds``; ``growth`` with a target.
+        report: JSON-able record: ``psnr`` of the training views' crops [dB], lowest ``view_psnr``, ``gaussians``,
+            ``iterations``, ``samples``, ``dropout``, ``seconds``; ``growth`` with a target.
     """
 
     cloud: GaussianCloud
@@ -219,6 +240,27 @@ def mean_psnr(psnr: NDArray[np.float64]) -> float:
     """Return the mean over views that show the subject; `NO_PSNR` if none does."""
     known = psnr[np.isfinite(psnr)]
     return float(known.mean()) if len(known) else NO_PSNR
+
+
+def chosen_dropout(dropout: float | Literal["auto"], count: int, views: Sequence[CapturedView]) -> float:
+    """Return the part of the Gaussians that a step leaves out.
+
+    Args:
+        dropout: That part; ``"auto"``: what the photographs' noise asks for, in the median, see `DROPOUT_OF_NOISE`.
+        count: Number of Gaussians.
+        views: The photographs.
+    """
+    if dropout != "auto":
+        return float(dropout)
+    subjects = [np.ones(view.color.shape[:2], bool) if view.alpha is None else view.alpha > WHOLE for view in views]
+    noise = [relative_noise(view.color, subject) for view, subject in zip(views, subjects, strict=True)]
+    wanted = [
+        DROPOUT_OF_NOISE * deviation**2 * max(count / subject.sum() - NEEDED, 0.0)
+        for deviation, subject in zip(noise, subjects, strict=True)
+        if np.isfinite(deviation)
+    ]
+    part = float(np.median(wanted)) if wanted else 0.0
+    return min(part, MOST_DROPOUT) if part >= LEAST_DROPOUT else 0.0
 
 
 def fit_gaussians(
@@ -299,6 +341,7 @@ class Fitter:
     Attributes:
         parameters: The Gaussians.
         samples: Side of the square of samples of a pixel.
+        dropout: Part of the Gaussians that a step leaves out.
     """
 
     def __init__(
@@ -315,6 +358,7 @@ class Fitter:
         count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
         self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
         self.samples = chosen_samples(options.samples, start, views)
+        self.dropout = chosen_dropout(options.dropout, count, views)
         self._targets = targets or TargetSet(views, count, options.raster, self.samples, device)
         center = np.median(start.positions, axis=0)
         extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
@@ -373,6 +417,7 @@ class Fitter:
             "gaussians": int(self.parameters.alive().sum()),
             "iterations": self._taken,
             "samples": self.samples,
+            "dropout": self.dropout,
         }
 
     def psnr(self) -> NDArray[np.float64]:
@@ -425,6 +470,8 @@ class Fitter:
         """Draw the view that was selected, compare, and move the Gaussians."""
         parameters = self.parameters
         parameters.activate()
+        if self.dropout > 0.0:
+            parameters.drop_out(self.dropout, self.options.seed)
         group.rasterizer.redraw()
         group.add_losses(index, self._weights, values=False)
         drawn = group.rasterizer.backward()
@@ -442,6 +489,7 @@ class Fitter:
         opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
         unwanted = alive & ~(opacity >= chosen.dead_opacity)
         if chosen.hidden_share > 0.0:
+            self.parameters.activate()  # the last step may have left some out
             unwanted |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
         changed = refine(rows, alive, unwanted, self._mean_gradients(), chosen.split_fraction)
         self.parameters.set_rows(rows)

@@ -168,6 +168,7 @@ def _shown_offsets(views: Sequence[CapturedView], options: FitOptions, device: A
         samples=1,
         temporal=0.0,
         refine_every=0,
+        dropout=0.0,
     )
     fitter = Fitter(reduced, start, fitting, device)
     fitter.run()

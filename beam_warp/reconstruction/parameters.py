@@ -16,7 +16,12 @@ from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import LINEAR_REC709
 from beam_warp.kernels.common.row_sums import launch_add_rows
-from beam_warp.kernels.reconstruction.activation import Shapes, launch_activate, launch_add_shape_gradients
+from beam_warp.kernels.reconstruction.activation import (
+    Shapes,
+    launch_activate,
+    launch_add_shape_gradients,
+    launch_drop_out,
+)
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, GaussianGradients
 from beam_warp.world.gaussians import MAX_SH_DEGREE, GaussianCloud
@@ -90,6 +95,7 @@ class GaussianParameters:
             None,
             self.radiance,
         )
+        self._turns = wp.zeros(rows, dtype=int, device=device)
         self._shapes = Shapes()
         self._shapes.log_scales, self._shapes.logits, self._shapes.filters = self.log_scales, self.logits, self.filters
         self.activate()
@@ -101,6 +107,18 @@ class GaussianParameters:
     def activate(self) -> None:
         """Bring the drawn scales and opacities up to date."""
         launch_activate(self.drawn.scales.size, self._shapes, self.drawn.scales, self.drawn.opacities, self.device)
+
+    def drop_out(self, part: float, seed: int) -> None:
+        """Draw a random part of the Gaussians no more, until `activate` is called; others each time.
+
+        Opacities of the others rise, so that the light that passes them all is the same in the mean, as far as
+        `ALPHA_MAX` allows. Gradients are not told: an optimiser that looks at their signs alone need not know.
+
+        Args:
+            part: How large a part, in [0, 1).
+            seed: Same seed, same Gaussians.
+        """
+        launch_drop_out(len(self), part, seed, self._turns, self.drawn.opacities, self.device)
 
     def zero_gradients(self) -> None:
         """Begin a new sum of gradients."""

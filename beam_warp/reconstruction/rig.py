@@ -306,6 +306,7 @@ class RigFitter(Fitter):
             samples=1,
             temporal=0.0,
             refine_every=0,
+            dropout=0.0,
         )
         super().__init__(reduced, start, fitting, device)
         self.cameras = list(cameras)

@@ -4,13 +4,18 @@ Scales are moved as logarithms and opacities as logits, so that no step leaves t
 Gaussian to what its training images can show, and takes the opacity that this adds away again: with f the filter's
 deviation, s_i' = sqrt(s_i^2 + f^2) and o' = o prod s_i / s_i' (Yu et al. 2024, Mip-Splatting, Eq. 8). Here only for the
 two larger axes: the thickness of a disc is no detail that an image shows, and would fade it out.
+
+Dropout leaves a random part of the Gaussians out of a step, another one each time (Srivastava et al. 2014; Park et al.
+2025 for Gaussians). Those that stay are more opaque in return, so that what passes all of them is the same in the mean.
 """
 
 from typing import Any
 
 import warp as wp
 
+from beam_warp.kernels.common.constants import ALPHA_MAX
 from beam_warp.kernels.common.launching import launch, launcher
+from beam_warp.kernels.common.sampling import stream_of, unit_float
 
 wp.set_module_options({"enable_backward": False})
 
@@ -73,6 +78,18 @@ def activate_kernel(first: int, shapes: Shapes, out_scales: wp.array[wp.vec3], o
 
 
 @wp.kernel
+def drop_out_kernel(first: int, part: float, seed: wp.uint32, turns: wp.array[int], out_opacities: wp.array[float]):
+    item = first + wp.tid()
+    turn = turns[item]
+    turns[item] = turn + 1
+    opacity = out_opacities[item]
+    if unit_float(stream_of(seed, wp.uint32(turn), wp.uint32(item))) < part:
+        out_opacities[item] = 0.0
+    else:
+        out_opacities[item] = wp.max(opacity, wp.min(opacity / (1.0 - part), ALPHA_MAX))
+
+
+@wp.kernel
 def add_shape_gradients_kernel(
     first: int,
     shapes: Shapes,
@@ -112,6 +129,9 @@ def add_shape_gradients_kernel(
 
 launch_activate = launcher(activate_kernel)
 """Write the scales and opacities that are drawn."""
+
+launch_drop_out = launcher(drop_out_kernel)
+"""Leave out a part of the Gaussians that are drawn, and count the turn of each: the next one leaves out others."""
 
 
 def launch_add_shape_gradients(

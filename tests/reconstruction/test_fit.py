@@ -12,7 +12,7 @@ from support.threads import require_same_on_any_threads
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction import fit as fit_module
-from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, fit_gaussians
+from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, chosen_dropout, fit_gaussians
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.targets import MOST_SAMPLES, LossWeights
 
@@ -171,10 +171,58 @@ class TestBits:
         views = ball_views(rig(2, 48))  # 9,216 samples, 1,100 rows: several chunks of every kernel
         changes = {"gaussian_count": 1100, "normal_iterations": 4, "refine_every": 2, "refine_until": 1.0, "samples": 2}
         require_same_on_any_threads(monkeypatch, lambda: fitted_arrays(views, device, **changes))
+        require_same_on_any_threads(monkeypatch, lambda: fitted_arrays(views, device, dropout=0.1, **changes))
 
     def test_another_seed_is_another_order(self, device, views):
         pairs = zip(fitted_arrays(views, device), fitted_arrays(views, device, seed=1), strict=True)
         assert any((one != other).any() for one, other in pairs)
+
+
+def noisy(view, rng, deviation):
+    """A photograph with photon noise: a variance of ``deviation`` squared, over the value."""
+    noise = deviation * np.sqrt(view.color) * rng.normal(size=view.color.shape)
+    return replace(view, color=(view.color + noise).astype(np.float32))
+
+
+class TestDropout:
+    def test_as_much_as_noise_asks_for(self, rng):
+        """Twice the noise's variance over the level, for each of three Gaussians a pixel beyond two; or the most."""
+        clean = ball_views(rig(6, size=96))
+        solid = [view.alpha > 0.999 for view in clean]
+        level = np.median([np.median(view.color[inside]) for view, inside in zip(clean, solid, strict=True)])
+        count = 5 * int(np.median([inside.sum() for inside in solid]))
+        for deviation in (0.02, 0.05):
+            found = chosen_dropout("auto", count, [noisy(view, rng, deviation) for view in clean])
+            assert found == pytest.approx(2.0 * 3.0 * deviation**2 / level, rel=0.1)
+        assert chosen_dropout("auto", count, [noisy(view, rng, 0.2) for view in clean]) == 0.2
+
+    def test_nothing_where_nothing_asks_for_it(self, rng, views):
+        """Clean photographs, fewer Gaussians than pixels, subjects too small to tell noise; nor where it is stated."""
+        clean = ball_views(rig(6, size=96))
+        assert chosen_dropout("auto", 10_000, clean) == 0.0
+        assert chosen_dropout("auto", 300, [noisy(view, rng, 0.05) for view in clean]) == 0.0
+        assert chosen_dropout("auto", 10_000, [noisy(view, rng, 0.05) for view in views]) == 0.0
+        assert chosen_dropout(0.07, 10_000, clean) == 0.07
+
+    def test_many_gaussians_paint_less_for_each_photograph_alone(self, device, rng):
+        """More than two for a pixel, 12 photographs: others in between are met better by .2 dB and more (.4 found)."""
+        seen = [noisy(view, rng, 0.1) for view in ball_views(rig(12))]
+        between = [ball_view(camera) for camera in rig(6, size=44, vertical_fov=35.0)]
+        start = ball_cloud(1_500, painted=False)
+
+        def met(**changes):
+            fit = fitted(seen, start, device, gaussian_count=1_500, normal_iterations=400, **changes)
+            return fit.report, fitter_of(between, fit.cloud, few_steps(), device).psnr().mean()
+
+        (plain, before), (dropped, after) = met(dropout=0.0), met(dropout=0.1)
+        assert (plain["dropout"], dropped["dropout"]) == (0.0, 0.1)
+        assert dropped["psnr"] < plain["psnr"]
+        assert after > before + 0.2
+
+    def test_none_is_taken_for_hidden_because_it_was_left_out(self, device, views):
+        """A fifth is left out of the last step before a refinement, which drops what shows nothing: nobody here."""
+        fit = fitted(views, ball_cloud(60), device, hidden_share=1e-9, dropout=0.2, **UNSPLIT)
+        assert len(fit.cloud) == 60
 
 
 class TestTarget:
@@ -252,6 +300,7 @@ OUT_OF_RANGE = {
         "sh_degree": (-1, 5),
         "samples": (0, 9, "many", None),
         "temporal": (-0.1, np.nan),
+        "dropout": (-0.1, 0.3, np.nan, "much", None),
         **dict.fromkeys(("refine_until", "split_fraction", "hidden_share", "dead_opacity"), (-0.1, 1.1, np.nan)),
     },
     LearningRates: dict.fromkeys(

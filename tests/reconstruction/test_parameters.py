@@ -101,6 +101,49 @@ class TestRowsWithoutAGaussian:
             np.testing.assert_array_equal(parameters.gradient(name).numpy(), expected)
 
 
+class TestDropout:
+    """Out of 4,000 Gaussians, a quarter is left out: 1,000, with a standard deviation of 27."""
+
+    COUNT, PART = 4_000, 0.25
+
+    def parameters(self, device, opacities):
+        return parameters_of(ball_cloud(self.COUNT).with_arrays(opacities=opacities), device)
+
+    def drawn(self, parameters, seed=0):
+        parameters.activate()
+        parameters.drop_out(self.PART, seed)
+        return parameters.drawn.opacities.numpy().copy()
+
+    def test_light_that_passes_stays_the_same_in_the_mean(self, device, rng):
+        opacities = rng.uniform(0.05, 0.7, self.COUNT)
+        found = self.drawn(self.parameters(device, opacities))
+        kept = found > 0.0
+        assert abs((~kept).sum() - self.PART * self.COUNT) < 4.0 * 27.0
+        np.testing.assert_allclose(found[kept], opacities[kept] / (1.0 - self.PART), rtol=1e-5)
+
+    def test_opaque_ones_stay_below_the_rasteriser_s_limit_and_never_fade(self, device):
+        opacities = np.resize([0.9, 0.9985], self.COUNT)
+        found = self.drawn(self.parameters(device, opacities))
+        limits = np.resize([0.99, 0.9985], self.COUNT)
+        np.testing.assert_allclose(found[found > 0.0], limits[found > 0.0], rtol=1e-5)
+
+    def test_others_each_time_and_the_same_again(self, device):
+        """Two draws share a sixteenth: 250, with a deviation of 15; so do draws of two seeds."""
+        one, again = (self.parameters(device, np.full(self.COUNT, 0.5)) for _ in range(2))
+        first, second = self.drawn(one), self.drawn(one)
+        np.testing.assert_array_equal(self.drawn(again), first)
+        np.testing.assert_array_equal(self.drawn(again), second)
+        other = self.drawn(self.parameters(device, np.full(self.COUNT, 0.5)), seed=1)
+        for draw in (second, other):
+            assert abs(((first == 0.0) & (draw == 0.0)).sum() - 250) < 4.0 * 15.0
+
+    def test_activation_brings_all_back(self, device):
+        parameters = self.parameters(device, np.full(self.COUNT, 0.5))
+        self.drawn(parameters)
+        parameters.activate()
+        np.testing.assert_allclose(parameters.drawn.opacities.numpy(), 0.5, rtol=1e-5)
+
+
 class TestOptimizer:
     def test_each_group_has_its_rate_and_those_left_out_stay(self, device, rng):
         """A first step is the rate, whatever the gradient: band 0 by its own, the others by theirs."""

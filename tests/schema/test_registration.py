@@ -111,8 +111,7 @@ def test_importing_the_package_loads_no_usd():
 
 
 def test_jobs_load_usd_before_they_begin_threads():
-    """Loaded beside other threads it may wait for the interpreter while one of them, who has it, waits for the loader:
-    1 run of 20 stood still for ever."""
+    """Beside other threads it may wait for the interpreter, while the thread that has it waits for the loader."""
     for job in ("reconstruction", "decomposition"):
         assert run(f"import beam_warp.{job}.job, sys; print('pxr.Tf' in sys.modules)").strip() == "True"
 
