@@ -53,7 +53,8 @@ def test_spoiled_files(name, tmp_path, capsys, monkeypatch):
     reader = READERS[name]
     path = reader.make(tmp_path)
     sound, beside = path.read_bytes(), {file.name for file in tmp_path.iterdir()}
-    assert outcome(reader, path, capsys)[0] == 0
+    code, printed, *_ = outcome(reader, path, capsys)
+    assert code == 0, printed
     faults = []
     for case in cases(reader, sound):
         path.write_bytes(case.content)

@@ -110,12 +110,6 @@ def test_importing_the_package_loads_no_usd():
     assert run("import beam_warp.schema, sys; print('pxr' in sys.modules)").strip() == "False"
 
 
-def test_jobs_load_usd_before_they_begin_threads():
-    """Beside other threads it may wait for the interpreter, while the thread that has it waits for the loader."""
-    for job in ("reconstruction", "decomposition"):
-        assert run(f"import beam_warp.{job}.job, sys; print('pxr.Tf' in sys.modules)").strip() == "True"
-
-
 def test_late_registration_warns_with_the_remedy():
     code = (
         "import warnings, beam_warp.schema as s\n"
