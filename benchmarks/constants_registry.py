@@ -216,12 +216,12 @@ TRACKING = (
     Constant("beam_warp.reconstruction.joints.selection:OVERSAMPLING", BOTH, "Candidates for a joint."),
     Constant("beam_warp.reconstruction.joints.selection:NEIGHBORS", JUDGED, "Neighbours of one that is not astray."),
     *(
-        Constant(f"beam_warp.reconstruction.fit:{name}", ALL, does, CLEAN_PHOTOGRAPHS)
-        for name, does in (
-            ("DROPOUT_OF_NOISE", "Part that a step leaves out, over noise and what a pixel has too many."),
-            ("NEEDED", "Gaussians that a pixel of the subject needs."),
-            ("LEAST_DROPOUT", "Part below which none is left out."),
-            ("MOST_DROPOUT", "Largest part that is left out."),
+        Constant(f"beam_warp.reconstruction.fit:{name}", chosen_on, does, CLEAN_PHOTOGRAPHS)
+        for name, chosen_on, does in (
+            ("DROPOUT_OF_NOISE", ALL, "Part that a step leaves out, over noise and what a pixel has too many."),
+            ("NEEDED", "a painted ball", "Gaussians that a pixel of the subject needs."),
+            ("LEAST_DROPOUT", JUDGED, "Part below which none is left out."),
+            ("MOST_DROPOUT", JUDGED, "Largest part that is left out."),
         )
     ),
     Constant(TRACK + "TrackOptions.reach", WALKER, "Pixels from which on silhouettes are asked.", FAR_MOTION),

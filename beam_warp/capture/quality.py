@@ -130,14 +130,13 @@ def quality_of(record: CaptureRecord, view: CapturedView) -> ImageQuality:
         MissingFileError, AssetFormatError: The image cannot be read any more.
     """
     loss = 0.0 if is_film(record.image_path) else quantization_error(record.image_path)
+    noise = relative_noise(view.color, subject_pixels(view))
     if view.alpha is None:
-        solid = np.ones(view.color.shape[:2], bool)
-        return ImageQuality((np.nan, np.nan), relative_noise(view.color, solid), loss, by_coverage=False)
+        return ImageQuality((np.nan, np.nan), noise, loss, by_coverage=False)
     is_photograph = view.mask_offset is not None or record.mask_path is not None or record.plate_path is not None
     shown = record.image().linear_rgba()[..., :3] if is_photograph else view.alpha[..., None]
-    blur, noise = edge_blur(shown, view.alpha), relative_noise(view.color, view.alpha > WHOLE)
     blots = blotted(shown, view.alpha) if is_photograph else 0
-    return ImageQuality(blur, noise, loss, by_coverage=not is_photograph, blots=blots)
+    return ImageQuality(edge_blur(shown, view.alpha), noise, loss, by_coverage=not is_photograph, blots=blots)
 
 
 def blotted(image: NDArray[np.float32], alpha: NDArray[np.float32]) -> int:
@@ -293,6 +292,11 @@ def photon_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:
     covariances = np.einsum("kpc,kpd->kcd", differences, differences) / differences.shape[1]
     least = np.linalg.eigvalsh(covariances)[:, 0]
     return float(np.quantile(least, QUARTILE) / LEAST_OVER_VARIANCE)
+
+
+def subject_pixels(view: CapturedView) -> NDArray[np.bool_]:
+    """Return which pixels show the subject alone, ``(H, W)``: all of them where coverage is not known."""
+    return np.ones(view.color.shape[:2], bool) if view.alpha is None else view.alpha > WHOLE
 
 
 def relative_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> float:

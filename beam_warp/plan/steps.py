@@ -71,7 +71,10 @@ class Work(Protocol):
 
     @property
     def later(self) -> tuple[str, ...]:
-        """Modules that some steps need, and that take long to import: whoever has time does that ahead."""
+        """Modules that some steps need, and that take long to import: whoever has time does that ahead, in a thread.
+
+        None may bring OpenUSD along, see `beam_warp.converters.clips`.
+        """
         ...
 
     def common(self) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.capture.quality import WHOLE, relative_noise
+from beam_warp.capture.quality import relative_noise, subject_pixels
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
@@ -73,8 +73,7 @@ NEEDED = 2.0
 and what is left out is missed."""
 
 LEAST_DROPOUT, MOST_DROPOUT = 0.005, 0.2
-"""Below the first, nothing is left out, and fits to clean photographs keep their bits. Above the second, what is left
-covers the subject no more."""
+"""Below the first, nothing is left out, as if photographs were clean. The second is the largest part that was tried."""
 
 
 @dataclass(frozen=True)
@@ -252,7 +251,7 @@ def chosen_dropout(dropout: float | Literal["auto"], count: int, views: Sequence
     """
     if dropout != "auto":
         return float(dropout)
-    subjects = [np.ones(view.color.shape[:2], bool) if view.alpha is None else view.alpha > WHOLE for view in views]
+    subjects = [subject_pixels(view) for view in views]
     noise = [relative_noise(view.color, subject) for view, subject in zip(views, subjects, strict=True)]
     wanted = [
         DROPOUT_OF_NOISE * deviation**2 * max(count / subject.sum() - NEEDED, 0.0)

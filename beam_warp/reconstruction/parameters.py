@@ -112,7 +112,7 @@ class GaussianParameters:
         """Draw a random part of the Gaussians no more, until `activate` is called; others each time.
 
         Opacities of the others rise, so that the light that passes them all is the same in the mean, as far as
-        `ALPHA_MAX` allows. Gradients are not told: an optimiser that looks at their signs alone need not know.
+        `ALPHA_MAX` allows. Gradients are not told: Adam, which divides them by their size, need not know.
 
         Args:
             part: How large a part, in [0, 1).

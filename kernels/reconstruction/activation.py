@@ -78,10 +78,10 @@ def activate_kernel(first: int, shapes: Shapes, out_scales: wp.array[wp.vec3], o
 
 
 @wp.kernel
-def drop_out_kernel(first: int, part: float, seed: wp.uint32, turns: wp.array[int], out_opacities: wp.array[float]):
+def drop_out_kernel(first: int, part: float, seed: wp.uint32, out_turns: wp.array[int], out_opacities: wp.array[float]):
     item = first + wp.tid()
-    turn = turns[item]
-    turns[item] = turn + 1
+    turn = out_turns[item]
+    out_turns[item] = turn + 1
     opacity = out_opacities[item]
     if unit_float(stream_of(seed, wp.uint32(turn), wp.uint32(item))) < part:
         out_opacities[item] = 0.0
