@@ -24,7 +24,8 @@ LAMPS = "only lamps use it; relit views have none"
 EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 MASKED = "these captures have masks; it counts only for photographs without"
 EXACT_EXPOSURES = "exposures of these captures are equal, and colours stay as they are"
-CLEAN_PHOTOGRAPHS = "photographs of these captures are clean, and steps leave out no Gaussians"
+CLEAN_PHOTOGRAPHS = "photographs of these captures are clean, and noise asks for no dropout"
+MANY_PHOTOGRAPHS = "these captures have so many photographs that opacities are not reset"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 SCENE_LINEAR = "the captures are scene-linear, so that no exposure is looked for"
 FAR_MOTION = "only motion beyond the reach of reduced images uses it, which these frames do not have"
@@ -219,11 +220,22 @@ TRACKING = (
         Constant(f"beam_warp.reconstruction.fit:{name}", chosen_on, does, CLEAN_PHOTOGRAPHS)
         for name, chosen_on, does in (
             ("DROPOUT_OF_NOISE", ALL, "Part that a step leaves out, over noise and what a pixel has too many."),
-            ("NEEDED", "a painted ball", "Gaussians that a pixel of the subject needs."),
             ("LEAST_DROPOUT", JUDGED, "Part below which none is left out."),
             ("MOST_DROPOUT", JUDGED, "Largest part that is left out."),
         )
     ),
+    Constant(FIT + "EARLY_DROPOUT", ALL, "Part that a step leaves out in the first half, where it can be spared."),
+    Constant(FIT + "NEEDED", "a painted ball", "Gaussians that a pixel of the subject needs."),
+    *(
+        Constant(FIT + name, ALL, does, MANY_PHOTOGRAPHS)
+        for name, does in (
+            ("PLENTY", "Photographs from which on opacities are not reset, nor Gaussians and steps saved."),
+            ("RESET_OPACITY", "Most opacity after a reset."),
+            ("RESET_AFTER", "Part of all steps before it."),
+            ("RESET_STEPS", "Fewest steps of a fit that has one."),
+        )
+    ),
+    Constant(FIT + "FitOptions.reset_below", ALL, "Photographs from which on there is none.", MANY_PHOTOGRAPHS),
     Constant(TRACK + "TrackOptions.reach", WALKER, "Pixels from which on silhouettes are asked.", FAR_MOTION),
     Constant(FAR + "MOST_NODES " + FAR + "POINTS_PER_NODE", WALKER, "Points of either surface.", FAR_MOTION),
     Constant(FAR + "HULL_RESOLUTION", JUDGED, "Voxels of the hull that joints are moved to.", FAR_MOTION),
@@ -398,7 +410,6 @@ MATERIALS = (
     *(
         Constant(f"beam_warp.{place}", "photographs of a statue", does, MASKED)
         for place, does in (
-            ("reconstruction.steps:PLENTY", "Photographs from which on all Gaussians and steps are spent."),
             ("reconstruction.steps:COMPARED", "Points at which exposures are compared."),
             ("reconstruction.stereo:ROUNDS", "Times that pixels improve their planes at a level."),
             ("reconstruction.stereo:AGREEMENTS", "Times that views look at each other's depths."),
@@ -598,6 +609,7 @@ UNTUNED = {
         TrackOptions: joints.weights.normal
         TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every refinement.dropout
+        TrackOptions: refinement.reset_below
         TrackOptions: refinement.refine_until refinement.split_fraction refinement.hidden_share refinement.dead_opacity
         BakeOptions: passes ridge temporal low high""",
     "limits of memory, time and floating point, and sizes of blocks": """

@@ -63,6 +63,10 @@ LEAST_GAIN = 0.15
 FEWEST_GAUSSIANS = 2_000
 """Fewest Gaussians with which a fit to a target PSNR begins."""
 
+EARLY_DROPOUT = 0.1
+"""Part of the Gaussians that steps leave out in their first half, if a pixel has twice as many as `NEEDED`. What lies
+behind others is seen at times then, and can become the surface: pockets fill less."""
+
 DROPOUT_OF_NOISE = 2.0
 """Part of the Gaussians that a step leaves out, over the variance of the photographs' noise and the number of Gaussians
 that a pixel of the subject has beyond `NEEDED`. Dropout acts like a ridge (Wager et al. 2013), whose weight is to be as
@@ -74,6 +78,18 @@ and what is left out is missed."""
 
 LEAST_DROPOUT, MOST_DROPOUT = 0.005, 0.2
 """Below the first, nothing is left out, as if photographs were clean. The second is the largest part that was tried."""
+
+PLENTY = 24
+"""Photographs from which on each Gaussian is seen by as many as on the captures that the schedule was chosen on."""
+
+RESET_OPACITY = 0.1
+"""Most opacity after a reset: that with which points begin that may be wrong, see `initial.BALL_OPACITY`."""
+
+RESET_AFTER = 1.0 / 6.0
+"""Part of all steps after which opacities are reset: colours are found by then, and most of the time is left."""
+
+RESET_STEPS = 1_000
+"""Fewest steps of a fit whose opacities are reset: it takes some 150 to be opaque again, and drafts lose by it."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +149,10 @@ class FitOptions:
             all: about a third of all Gaussians, which sank behind others and which no gradient pulls back.
         dead_opacity: Gaussians below it are dropped.
         dropout: Part of the Gaussians that a step leaves out, others each time, so that none of them learns the noise
-            of a photograph; ``"auto"``: as the photographs' noise asks for, see `chosen_dropout`.
+            of a photograph; ``"auto"``: see `chosen_dropout`.
+        reset_below: With fewer photographs, of known coverage, the refinement after `RESET_AFTER` of `RESET_STEPS` or
+            more lowers all opacities to `RESET_OPACITY` (Kerbl et al. 2023): a layer that few of them agree on hides
+            others no more, and must earn its opacity again.
         seed: Same seed, same device, same result.
 
     Raises:
@@ -157,6 +176,7 @@ class FitOptions:
     hidden_share: float = 0.01
     dead_opacity: float = 0.02
     dropout: float | Literal["auto"] = "auto"
+    reset_below: int = PLENTY
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -164,7 +184,7 @@ class FitOptions:
         require_count("gaussian_count", self.gaussian_count, 1, 2**24)
         if self.target_psnr is not None:
             require_number("target_psnr", self.target_psnr, 1.0, 120.0)
-        for name in ("color_iterations", "normal_iterations", "refine_every", "seed"):
+        for name in ("color_iterations", "normal_iterations", "refine_every", "reset_below", "seed"):
             require_count(name, getattr(self, name), 0)
         require_count("sh_degree", self.sh_degree, 0, 4)
         if self.samples != "auto":
@@ -190,7 +210,8 @@ class FitOptions:
         """
         require_choice("preset", preset, PRESETS)
         rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
-        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05, "dropout": 0.0}
+        common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
+        common |= {"dropout": 0.0, "reset_below": 0}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
             "draft": {
@@ -228,7 +249,8 @@ class Fit:
     Attributes:
         cloud: Gaussians with scene-linear radiance and ids.
         report: JSON-able record: ``psnr`` of the training views' crops [dB], lowest ``view_psnr``, ``gaussians``,
-            ``iterations``, ``samples``, ``dropout``, ``seconds``; ``growth`` with a target.
+            ``iterations``, ``samples``, ``dropout`` in the first half of the steps and afterwards, ``seconds``;
+            ``growth`` with a target.
     """
 
     cloud: GaussianCloud
@@ -241,25 +263,25 @@ def mean_psnr(psnr: NDArray[np.float64]) -> float:
     return float(known.mean()) if len(known) else NO_PSNR
 
 
-def chosen_dropout(dropout: float | Literal["auto"], count: int, views: Sequence[CapturedView]) -> float:
-    """Return the part of the Gaussians that a step leaves out.
+def chosen_dropout(dropout: float | Literal["auto"], count: int, views: Sequence[CapturedView]) -> tuple[float, float]:
+    """Return the parts of the Gaussians that a step leaves out: in the first half of all steps, and afterwards.
 
     Args:
-        dropout: That part; ``"auto"``: what the photographs' noise asks for, in the median, see `DROPOUT_OF_NOISE`.
+        dropout: Both; ``"auto"``: what the photographs' noise asks for, in the median, see `DROPOUT_OF_NOISE`, and in
+            the first half `EARLY_DROPOUT` at least. None where a pixel has no more Gaussians than `NEEDED`.
         count: Number of Gaussians.
         views: The photographs.
     """
     if dropout != "auto":
-        return float(dropout)
+        return float(dropout), float(dropout)
     subjects = [subject_pixels(view) for view in views]
-    noise = [relative_noise(view.color, subject) for view, subject in zip(views, subjects, strict=True)]
-    wanted = [
-        DROPOUT_OF_NOISE * deviation**2 * max(count / subject.sum() - NEEDED, 0.0)
-        for deviation, subject in zip(noise, subjects, strict=True)
-        if np.isfinite(deviation)
-    ]
-    part = float(np.median(wanted)) if wanted else 0.0
-    return min(part, MOST_DROPOUT) if part >= LEAST_DROPOUT else 0.0
+    spare = np.array([max(count / max(np.count_nonzero(subject), 1) - NEEDED, 0.0) for subject in subjects])
+    noise = np.array([relative_noise(view.color, subject) for view, subject in zip(views, subjects, strict=True)])
+    wanted = (DROPOUT_OF_NOISE * noise**2 * spare)[np.isfinite(noise)]
+    early = EARLY_DROPOUT * min(float(np.median(spare)) / NEEDED, 1.0)
+    always = min(float(np.median(wanted)), MOST_DROPOUT) if len(wanted) else 0.0
+    first, then = (part if part >= LEAST_DROPOUT else 0.0 for part in (max(early, always), always))
+    return first, then
 
 
 def fit_gaussians(
@@ -328,6 +350,7 @@ def _grow(
         options = replace(
             options,
             color_iterations=0,
+            reset_below=0,
             normal_iterations=max(1, (options.color_iterations + options.normal_iterations) // 2)
             if len(growth) == 1
             else options.normal_iterations,
@@ -340,7 +363,7 @@ class Fitter:
     Attributes:
         parameters: The Gaussians.
         samples: Side of the square of samples of a pixel.
-        dropout: Part of the Gaussians that a step leaves out.
+        dropout: Parts of the Gaussians that steps leave out, see `chosen_dropout`.
     """
 
     def __init__(
@@ -377,6 +400,10 @@ class Fitter:
         self._temporal = TemporalTerms(self.parameters, disc_spacing(start)) if options.temporal > 0.0 else None
         self._graphs = StepGraphs(device)
         self._weights = options.weights
+        self._left_out = self.dropout[0]
+        is_long = options.color_iterations + options.normal_iterations >= RESET_STEPS
+        is_sparse = len(views) < options.reset_below and all(view.alpha is not None for view in views)
+        self._is_reset = not (is_long and is_sparse)
         self._taken = 0
 
     def run(self, progress: StepProgress = no_progress) -> None:
@@ -392,6 +419,9 @@ class Fitter:
             if iteration == chosen.color_iterations:
                 self._weights = chosen.weights
                 self._graphs.clear()
+            if iteration == total // 2:
+                self._left_out = self.dropout[1]
+                self._graphs.clear()
             if iteration % PROGRESS_EVERY == 0:
                 self._set_rates(iteration / max(total - 1, 1))
                 progress(iteration, total, facts)
@@ -401,7 +431,7 @@ class Fitter:
             self._taken += 1
             is_due = bool(chosen.refine_every) and self._taken % chosen.refine_every == 0
             if is_due and self._taken <= chosen.refine_until * total:
-                self._refine()
+                self._refine(is_late=self._taken >= RESET_AFTER * total)
             if is_due or self._taken % RENEW_EVERY == 0:
                 facts = {"gaussians": float(self.parameters.alive().sum()), "psnr": self._renew()}
         facts["psnr"] = self._renew()
@@ -469,8 +499,8 @@ class Fitter:
         """Draw the view that was selected, compare, and move the Gaussians."""
         parameters = self.parameters
         parameters.activate()
-        if self.dropout > 0.0:
-            parameters.drop_out(self.dropout, self.options.seed)
+        if self._left_out > 0.0:
+            parameters.drop_out(self._left_out, self.options.seed)
         group.rasterizer.redraw()
         group.add_losses(index, self._weights, values=False)
         drawn = group.rasterizer.backward()
@@ -481,8 +511,8 @@ class Fitter:
             self._temporal.add_gradients(self.options.temporal)
         self._adam.step()
 
-    def _refine(self) -> None:
-        """Drop Gaussians that are not seen, and split those of large gradients into their rows."""
+    def _refine(self, *, is_late: bool) -> None:
+        """Drop Gaussians that are not seen, split those of large gradients into their rows, reset opacities once."""
         chosen = self.options
         rows, alive = self.parameters.rows(), self.parameters.alive()
         opacity = 1.0 / (1.0 + np.exp(-rows["logits"].astype(np.float64)))
@@ -490,6 +520,10 @@ class Fitter:
         if chosen.hidden_share > 0.0:
             self.parameters.activate()  # the last step may have left some out
             unwanted |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
+        if is_late and not self._is_reset:
+            logit = np.float32(np.log(RESET_OPACITY / (1.0 - RESET_OPACITY)))
+            rows["logits"][alive] = np.minimum(rows["logits"][alive], logit)
+            self._is_reset = True
         changed = refine(rows, alive, unwanted, self._mean_gradients(), chosen.split_fraction)
         self.parameters.set_rows(rows)
         self._adam.restart(changed)

@@ -19,7 +19,7 @@ from beam_warp.capture.findings import Finding
 from beam_warp.capture.mask_corrections import MaskCorrections
 from beam_warp.capture.views import CapturedView
 from beam_warp.raster.records import RasterOptions
-from beam_warp.reconstruction.fit import FitOptions, fit_gaussians
+from beam_warp.reconstruction.fit import PLENTY, FitOptions, fit_gaussians
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.gains import ViewGains, judge_gains, matched, view_gains
 from beam_warp.reconstruction.initial import initial_gaussians
@@ -38,10 +38,6 @@ smoothest."""
 
 MOST_UNPAIRED = 0.5
 """Part of the Gaussians seen by fewer than two views above which there is a finding: most of the surface."""
-
-PLENTY = 24
-"""Photographs without masks from which on all Gaussians and steps are spent: each is then looked at as often as those
-of the captures that the schedule was chosen on."""
 
 DOUBTFUL_TEAR = 0.005
 """Part of the joints that are torn above which there is a finding: where a limb was missed, the fit of the Gaussians

@@ -14,6 +14,7 @@ from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction import fit as fit_module
 from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, chosen_dropout, fit_gaussians
 from beam_warp.reconstruction.initial import initial_gaussians
+from beam_warp.reconstruction.parameters import GaussianParameters
 from beam_warp.reconstruction.targets import MOST_SAMPLES, LossWeights
 
 
@@ -193,16 +194,36 @@ class TestDropout:
         count = 5 * int(np.median([inside.sum() for inside in solid]))
         for deviation in (0.02, 0.05):
             found = chosen_dropout("auto", count, [noisy(view, rng, deviation) for view in clean])
-            assert found == pytest.approx(2.0 * 3.0 * deviation**2 / level, rel=0.1)
-        assert chosen_dropout("auto", count, [noisy(view, rng, 0.2) for view in clean]) == 0.2
+            assert found[1] == pytest.approx(2.0 * 3.0 * deviation**2 / level, rel=0.1)
+            assert found[0] == max(found[1], 0.1)
+        assert chosen_dropout("auto", count, [noisy(view, rng, 0.2) for view in clean]) == (0.2, 0.2)
 
     def test_nothing_where_nothing_asks_for_it(self, rng, views):
-        """Clean photographs, fewer Gaussians than pixels, subjects too small to tell noise; nor where it is stated."""
+        """Clean photographs, or too small to tell noise, after half of the steps; fewer Gaussians than pixels."""
         clean = ball_views(rig(6, size=96))
-        assert chosen_dropout("auto", 10_000, clean) == 0.0
-        assert chosen_dropout("auto", 300, [noisy(view, rng, 0.05) for view in clean]) == 0.0
-        assert chosen_dropout("auto", 10_000, [noisy(view, rng, 0.05) for view in views]) == 0.0
-        assert chosen_dropout(0.07, 10_000, clean) == 0.07
+        assert chosen_dropout("auto", 100_000, clean) == (0.1, 0.0)
+        assert chosen_dropout("auto", 100_000, [noisy(view, rng, 0.05) for view in views]) == (0.1, 0.0)
+        assert chosen_dropout("auto", 300, [noisy(view, rng, 0.05) for view in clean]) == (0.0, 0.0)
+        assert chosen_dropout(0.07, 100_000, clean) == (0.07, 0.07)
+
+    def test_at_first_as_many_as_can_be_spared(self):
+        """Half of the most, where a pixel has half as many beyond what it needs as it needs: three for two."""
+        clean = ball_views(rig(6, size=96))
+        pixels = int(np.median([np.count_nonzero(view.alpha > 0.999) for view in clean]))
+        assert chosen_dropout("auto", 3 * pixels, clean)[0] == pytest.approx(0.05, rel=0.05)
+        assert chosen_dropout("auto", 2 * pixels, clean)[0] <= 0.005
+
+    def test_the_second_half_has_its_own(self, device, views, monkeypatch):
+        heard = []
+        monkeypatch.setattr(GaussianParameters, "drop_out", lambda self, part, seed: heard.append(part))
+        for parts in ((0.1, 0.05), (0.1, 0.0)):
+            monkeypatch.setattr(fit_module, "chosen_dropout", lambda *_, found=parts: found)
+            heard.clear()
+            report = fitted(views, ball_cloud(60), device, normal_iterations=9).report
+            assert report["dropout"] == parts
+            if device == "cpu":  # steps that a GPU recorded are not told of again
+                assert heard == [0.1] * 4 + [0.05] * (5 if parts[1] else 0)
+            assert list(dict.fromkeys(heard)) == [part for part in parts if part]
 
     def test_many_gaussians_paint_less_for_each_photograph_alone(self, device, rng):
         """More than two for a pixel, 12 photographs: others in between are met better by .2 dB and more (.4 found)."""
@@ -215,7 +236,7 @@ class TestDropout:
             return fit.report, fitter_of(between, fit.cloud, few_steps(), device).psnr().mean()
 
         (plain, before), (dropped, after) = met(dropout=0.0), met(dropout=0.1)
-        assert (plain["dropout"], dropped["dropout"]) == (0.0, 0.1)
+        assert (plain["dropout"], dropped["dropout"]) == ((0.0, 0.0), (0.1, 0.1))
         assert dropped["psnr"] < plain["psnr"]
         assert after > before + 0.2
 
@@ -223,6 +244,45 @@ class TestDropout:
         """A fifth is left out of the last step before a refinement, which drops what shows nothing: nobody here."""
         fit = fitted(views, ball_cloud(60), device, hidden_share=1e-9, dropout=0.2, **UNSPLIT)
         assert len(fit.cloud) == 60
+
+
+SOON = {**UNSPLIT, "hidden_share": 0.0, "refine_every": 3}
+
+
+class TestReset:
+    @pytest.fixture(autouse=True)
+    def few_steps_are_enough(self, monkeypatch):
+        monkeypatch.setattr(fit_module, "RESET_STEPS", 3)
+
+    def test_opacities_are_lowered_once(self, device, views):
+        """Three steps end in a refinement; six in a second one, after three steps upwards."""
+        reset, later, never = (
+            fitted(views, ball_cloud(60), device, normal_iterations=steps, reset_below=below, **SOON).cloud.opacities
+            for steps, below in ((3, 24), (6, 24), (3, len(views)))
+        )
+        assert reset.max() <= 0.1001 < later.max()
+        assert never.min() > 0.2
+
+    def test_where_coverage_is_not_known_they_stay(self, device, views):
+        bare = [replace(view, alpha=None) for view in views]
+        assert fitted(bare, ball_cloud(60), device, normal_iterations=3, **SOON).cloud.opacities.min() > 0.2
+
+    def test_where_steps_are_too_few_they_stay(self, device, views, monkeypatch):
+        monkeypatch.setattr(fit_module, "RESET_STEPS", 4)
+        assert fitted(views, ball_cloud(60), device, normal_iterations=3, **SOON).cloud.opacities.min() > 0.2
+
+    def test_few_photographs_agree_on_more(self, device):
+        """Six, and 1,500 Gaussians from their visual hull: others in between are met better by .7 dB (1.5 found)."""
+        seen = ball_views(rig(6, size=64))
+        between = [ball_view(camera) for camera in rig(6, size=44, vertical_fov=35.0)]
+        start = initial_gaussians(seen, 1_500, device=device)
+        steps = {"color_iterations": 100, "normal_iterations": 200, "refine_every": 25, "dropout": 0.0}
+
+        def met(below):
+            fit = fitted(seen, start, device, gaussian_count=1_500, reset_below=below, **steps)
+            return fitter_of(between, fit.cloud, few_steps(), device).psnr().mean()
+
+        assert met(24) > met(0) + 0.7
 
 
 class TestTarget:
