@@ -8,7 +8,7 @@ between their two frames in few steps, to say what memory a longer take needs.
 
 Scored only, each row the walker's first frame: ``rade`` has others' choices, made ours one by one, ``rade_long`` the
 last of these with as many steps as they state; ``variants`` makes 3DGS's way of drawing ours one by one; ``gaussians``
-and ``cameras`` vary the number of either.
+and ``cameras`` vary the number of either, the latter with opacities kept and reset.
 
 ``strides`` plays the walker at every fourth frame, every second, and every one. What each tracks is scored, beside how
 far the true surface moves; where it began with what silhouettes show, also without them.
@@ -438,6 +438,15 @@ def variant_trials(bench: Bench) -> list[Trial]:
     ]
 
 
+def camera_trials(bench: Bench) -> list[Trial]:
+    """Return fits to some of the cameras and to all of them, with opacities kept and reset."""
+    more_than_all = len(training_cameras(bench.capture)) + 1
+    ways = {"kept": replace(bench.fitting, reset_below=0), "reset": replace(bench.fitting, reset_below=more_than_all)}
+    return [
+        Trial(name, options, cameras=count) for count in (*bench.effort.cameras, None) for name, options in ways.items()
+    ]
+
+
 def trials(make: Callable[[Bench], Sequence[Trial]]) -> Callable[[Bench], Iterator[Row]]:
     """Return the section that fits and scores some trials on the first capture."""
 
@@ -467,9 +476,7 @@ SECTIONS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "gaussians": trials(
         lambda bench: [Trial(f"{count}", replace(bench.fitting, gaussian_count=count)) for count in bench.effort.counts]
     ),
-    "cameras": trials(
-        lambda bench: [Trial(f"{count}", bench.fitting, cameras=count) for count in bench.effort.cameras]
-    ),
+    "cameras": trials(camera_trials),
     "rade_long": trials(lambda bench: _rade_trials(bench, bench.effort.long)[-1:]),
 }
 
