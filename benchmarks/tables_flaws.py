@@ -33,11 +33,11 @@ def scores(found: Sequence[Row]) -> Rows:
     return [head, *(_cells(label, rows) for label, rows in _groups(found))]
 
 
-@table("flaws_alone", "flaws_studio_h200.json", "flaws_alone_h200.json")
-def alone(together: Row, result: Row) -> Rows:
+@table("flaws_alone", "flaws_studio_h200.json", "flaws_vignetting_h200.json", "flaws_alone_h200.json")
+def alone(together: Row, lenses: Row, result: Row) -> Rows:
     """Return the scores of clean captures, and of those with one flaw of a studio's or of its lenses."""
-    clean = [row for row in together["rows"] if row["case"]["flaw"] != "flawed"]
-    return scores([*clean, *result["rows"]])
+    clean = [row for row in together["rows"] if row["case"]["flaw"] == "clean"]
+    return scores([*clean, *lenses["rows"], *result["rows"]])
 
 
 @table("flaws_others", "flaws_h200.json", "flaws_alone_h200.json")
@@ -62,13 +62,13 @@ def mended(result: Row) -> Rows:
     return rows
 
 
-@table("flaws_recovered", "flaws_studio_h200.json")
-def recovered(result: Row) -> Rows:
+@table("flaws_recovered", "flaws_studio_h200.json", "flaws_vignetting_h200.json")
+def recovered(result: Row, lenses: Row) -> Rows:
     """Return what the job makes of the light and of exposures, how honest stated errors are, and seconds."""
     head = ["what is wrong", "light made brighter [stop]", "should be", "largest exposure found [stop]", "injected"]
     head += ["vignetting undone [power]", "injected"]
     head += ["base colour within 1, 2 stated errors", "but for its scale", "roughness", "seconds"]
-    return [head, *(_recovered(label, rows) for label, rows in _groups(result["rows"]))]
+    return [head, *(_recovered(label, rows) for label, rows in _groups([*result["rows"], *lenses["rows"]]))]
 
 
 @table("flaws_named", "flaws_named_cpu.json")

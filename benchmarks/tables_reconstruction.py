@@ -13,6 +13,7 @@ from tables import Row, Rows, cell, figure, number, table
 MAIN = "reconstruction_h200.json"
 LARGE = "reconstruction_large_h200.json"
 CHOICES = "reconstruction_choices_h200.json"
+CAMERAS = "reconstruction_cameras_h200.json"
 STRIDES = "reconstruction_strides_h200.json"
 WALK, WITH_CASE = "steady_walk_h200.json", "steady_case_h200.json"
 EXPOSURES = "exposures_cpu.json"
@@ -102,6 +103,31 @@ def rade(choices: Row) -> Rows:
 def variants(choices: Row) -> Rows:
     """Return 3DGS's way of drawing, made ours one by one."""
     return _trial_rows("choices, added one by one", choices["variants"]["rows"])
+
+
+@table("reconstruction_cameras", CAMERAS)
+def few_cameras(sweep: Row) -> Rows:
+    """Return fits to some of the cameras, opacities kept and reset."""
+    rows = sweep["cameras"]["rows"]
+    head = ["cameras"]
+    head += [
+        f"{title}: opacities {name}" for title in ("PSNR, box [dB]", "normals, mean", "Chamfer [mm]") for name in WAYS
+    ]
+    body: list[list[Any]] = []
+    for count in sorted({row["cameras"] for row in rows}):
+        found = {row["name"]: row for row in rows if row["cameras"] == count}
+        body.append(
+            [
+                f"{count}",
+                *(f"{found[name]['psnr']:.2f}" for name in WAYS),
+                *(f"{found[name]['normals_mean_degrees']:.1f}°" for name in WAYS),
+                *(f"{found[name]['surface']['chamfer_mm']:.2f}" for name in WAYS),
+            ]
+        )
+    return [head, *body]
+
+
+WAYS = ("kept", "reset")
 
 
 def _trial_rows(title: str, rows: Sequence[Row]) -> Rows:
@@ -271,21 +297,23 @@ def draw_statue(_: Row, path: Path) -> None:
     materials_plot.draw_sheet(PICTURES / "statue.png", path)
 
 
-@figure("reconstruction.webp", MAIN, CHOICES)
-def draw(main: Row, choices: Row, path: Path) -> None:
+@figure("reconstruction.webp", MAIN, CHOICES, CAMERAS)
+def draw(main: Row, choices: Row, sweep: Row, path: Path) -> None:
     """Draw quality over Gaussians and over cameras, and drift over frames."""
     from matplotlib import pyplot as plt
 
     ours = choices["rade"]["rows"][-1]
     picture, panels = plt.subplots(2, 4, figsize=(18, 8), layout="constrained")
-    for row, across in zip(panels, ("gaussians", "cameras"), strict=True):
-        rows = sorted([*choices[across]["rows"], ours], key=lambda entry: entry[across])
-        counts = [entry[across] for entry in rows]
-        for axes, (title, value) in zip(row, MEASURES, strict=False):
-            axes.plot(counts, [value(entry) for entry in rows], "o-", label="in the box")
-            axes.set(title=title, xlabel=across)
-        row[0].plot(counts, [entry["whole_psnr"] for entry in rows], "s--", label="of whole images")
-        row[0].legend()
+    curves = {"gaussians": {"in the box": [*choices["gaussians"]["rows"], ours]}, "cameras": {}}
+    for name in WAYS:
+        curves["cameras"][f"opacities {name}"] = [row for row in sweep["cameras"]["rows"] if row["name"] == name]
+    for panel, (across, drawn_rows) in zip(panels, curves.items(), strict=True):
+        for label, found in drawn_rows.items():
+            rows = sorted(found, key=lambda entry: entry[across])
+            for axes, (title, value) in zip(panel, MEASURES, strict=False):
+                axes.plot([row[across] for row in rows], [value(row) for row in rows], "o-", label=label)
+                axes.set(title=title, xlabel=across)
+        panel[0].legend()
     for axes in panels[:, 1:3].flat:
         axes.set_ylim(0.0, None)
     for axes in panels[0, :3]:
