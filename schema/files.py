@@ -9,6 +9,7 @@ from __future__ import annotations
 import glob
 import json
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -98,6 +99,12 @@ def require_opens(path: Path) -> None:
     answer = run_child("beam_warp.schema.probe", path, PROBE_SECONDS + size_around(path) / PROBE_BYTES_PER_SECOND)
     if answer.get("error"):
         raise _broken(path, "must open in OpenUSD", str(answer["error"]))
+
+
+def said_by_usd(error: Exception) -> str:
+    """Return the messages of a `pxr.Tf.ErrorException` without OpenUSD's source lines, namespaces and repetition."""
+    words = dict.fromkeys(str(getattr(item, "commentary", item)) for item in error.args)
+    return re.sub(r"pxrInternal_\w+?pxrReserved_+(::|(?=\w))", "", " ".join(" ".join(words).split()))[:500]
 
 
 def size_around(path: Path) -> int:

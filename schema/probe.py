@@ -14,7 +14,7 @@ from pxr import Sdf, Tf, Usd, UsdUtils, Work
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
-from beam_warp.schema.files import SUFFIXES, require_whole_crate, size_around
+from beam_warp.schema.files import SUFFIXES, require_whole_crate, said_by_usd, size_around
 from beam_warp.schema.layout import CHANNELS
 from beam_warp.schema.stage_queries import clip_sets, splat_prims
 
@@ -69,12 +69,6 @@ def special_file(path: Path) -> str | None:
             elif found.exists():
                 return str(found)
     return None
-
-
-def said_by_usd(error: Tf.ErrorException) -> str:
-    """Return OpenUSD's messages without its source lines and without repetition."""
-    words = dict.fromkeys(str(getattr(item, "commentary", item)) for item in error.args)
-    return " ".join(" ".join(words).split())[:500]
 
 
 def _touch(prim: Usd.Prim) -> None:

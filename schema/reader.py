@@ -17,6 +17,7 @@ from beam_warp.checks import UNIT_TOLERANCE
 from beam_warp.errors import AssetFormatError, InvalidArrayError, SchemaVersionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.schema import MATERIAL_API, SCHEMA_VERSION
+from beam_warp.schema.files import said_by_usd
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, Channel, from_vt
 from beam_warp.schema.placement import placement_of
 from beam_warp.schema.stage_queries import (
@@ -146,7 +147,8 @@ class _FrameReader:
         except InvalidArrayError as error:
             raise AssetFormatError(f"{where}: {error}") from error
         except Tf.ErrorException as error:
-            raise AssetFormatError(f"{where} must be readable, got {error}. Export the file again.") from error
+            said = said_by_usd(error)
+            raise AssetFormatError(f"{where} must be readable, got {said}. Export the file again.") from error
 
     def constant(self) -> frozenset[str]:
         """Return the names of the arrays that do not vary."""

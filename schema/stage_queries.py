@@ -15,7 +15,7 @@ from beam_warp.image.color import DISPLAY_SRGB, LINEAR_REC709
 from beam_warp.outputs import keep_original, keeps_originals
 from beam_warp.schema import MATERIAL_API, SEQUENCE_API, register
 from beam_warp.schema.clips import CLIP_FRAMES
-from beam_warp.schema.files import require_asset_file, require_opens
+from beam_warp.schema.files import require_asset_file, require_opens, said_by_usd
 from beam_warp.schema.layout import CHANNELS, SPLAT_TYPE, UP_AXES, Channel
 
 _COLOR_SPACES = {
@@ -58,7 +58,8 @@ def open_asset(path: str | Path, *, trusted: bool) -> tuple[Path, Usd.Stage]:
             keep_original(source, *(Path(layer.realPath) for layer in layers), *map(Path, textures))
         return source, stage
     except Tf.ErrorException as error:
-        raise AssetFormatError(f"{source} must open in OpenUSD, got {error}. Export the file again.") from error
+        said = said_by_usd(error)
+        raise AssetFormatError(f"{source} must open in OpenUSD, got {said}. Export the file again.") from error
 
 
 def layer_files(path: Path) -> list[Path]:
@@ -70,7 +71,8 @@ def layer_files(path: Path) -> list[Path]:
     try:
         layers, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
     except Tf.ErrorException as error:
-        raise AssetFormatError(f"{path} must open in OpenUSD, got {error}. Export the file again.") from error
+        said = said_by_usd(error)
+        raise AssetFormatError(f"{path} must open in OpenUSD, got {said}. Export the file again.") from error
     if missing:
         raise AssetFormatError(f"{path} must have all its layers, got none at {missing[0]}. Copy it with them.")
     files = {Path(layer.realPath) for layer in layers if layer.realPath and Path(layer.realPath).is_file()}

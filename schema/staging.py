@@ -12,6 +12,7 @@ from pxr import Sdf, Tf
 
 from beam_warp.errors import OutputError
 from beam_warp.outputs import require_apart, temporary_path
+from beam_warp.schema.files import said_by_usd
 
 
 @contextmanager
@@ -36,8 +37,9 @@ def staged_folder(target: Path) -> Iterator[Path]:
     except (Tf.ErrorException, OSError) as error:
         if isinstance(error, OutputError):
             raise
+        reason = said_by_usd(error) if isinstance(error, Tf.ErrorException) else error
         raise OutputError(
-            f"{target} must be writable, got {error}. Free space or choose another place; nothing was left behind."
+            f"{target} must be writable, got {reason}. Free space or choose another place; nothing was left behind."
         ) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -19,8 +19,7 @@ from pxr import Sdf, Tf, Usd
 from beam_warp.checks import require_path
 from beam_warp.errors import AssetFormatError, OutputError
 from beam_warp.schema import register
-from beam_warp.schema.files import require_asset_file, run_child
-from beam_warp.schema.probe import said_by_usd
+from beam_warp.schema.files import require_asset_file, run_child, said_by_usd
 from beam_warp.schema.staging import publish, staged_folder
 from beam_warp.schema.validation.mends import MENDS
 from beam_warp.schema.validation.report import BrokenRule, Report

@@ -17,9 +17,9 @@ from pxr import Gf, Sdr, Tf, Usd, UsdValidation
 
 from beam_warp.errors import AssetFormatError
 from beam_warp.schema import register
-from beam_warp.schema.files import require_asset_file, run_child, size_around
+from beam_warp.schema.files import require_asset_file, run_child, said_by_usd, size_around
 from beam_warp.schema.layout import CHANNELS, SH_DEGREE, from_vt
-from beam_warp.schema.probe import limit_memory, said_by_usd, special_file
+from beam_warp.schema.probe import limit_memory, special_file
 from beam_warp.schema.stage_queries import array_attribute, authored, frame_times, is_keyed, sequence_prim, splat_prims
 from beam_warp.schema.validation.frame_rules import FRAME_RULES, FrameArrays
 from beam_warp.schema.validation.report import BrokenRule, Report, Severity

@@ -73,6 +73,18 @@ def test_a_fault_that_the_child_finds_is_an_error(tmp_path, sequence):
         read_asset(tmp_path / "a.usda")
 
 
+@pytest.mark.parametrize("trusted", [False, True])
+def test_what_openusd_says_is_told_without_its_source_lines(tmp_path, sequence, trusted):
+    write_asset(sequence(3), tmp_path / "a.usda")
+    text = (tmp_path / "a.usda").read_text()
+    (tmp_path / "a.usda").write_text(text.replace("{", "<", 1))
+    with pytest.raises(AssetFormatError, match=r"must open in OpenUSD, got .*a\.usda:\d+:\d+: parse error") as said:
+        read_asset(tmp_path / "a.usda", trusted=trusted)
+    assert "pxrInternal" not in str(said.value)
+    assert "/USD/" not in str(said.value)
+    assert "\n" not in str(said.value)
+
+
 def test_flipped_bits_never_crash(tmp_path, sequence, rng):
     path = tmp_path / "a.usdc"
     write_asset(sequence(2), path)
