@@ -64,8 +64,8 @@ FEWEST_GAUSSIANS = 2_000
 """Fewest Gaussians with which a fit to a target PSNR begins."""
 
 EARLY_DROPOUT = 0.1
-"""Part of the Gaussians that steps leave out in their first half, if a pixel has twice as many as `NEEDED`. What lies
-behind others is seen at times then, and can become the surface: pockets fill less."""
+"""Part of the Gaussians that steps leave out in their first half, if a pixel has twice as many as `NEEDED`: what lies
+behind others is seen at times then, and can become the surface."""
 
 DROPOUT_OF_NOISE = 2.0
 """Part of the Gaussians that a step leaves out, over the variance of the photographs' noise and the number of Gaussians
