@@ -160,18 +160,19 @@ def test_the_table_has_the_clean_capture_first_and_then_the_worst():
     assert [cells[1] for cells in body] == ["30.0 dB / 0.900", "21.0 dB / 0.900", "29.0 dB / 0.900"]
     assert [cells[-1] for cells in body] == ["also `few-cameras`", "masks in 1 of 2 runs", ""]
     together = {"rows": [row("clean", 31.0), row("flawed", 25.0)]}
-    _, *alone = tables_flaws.alone(together, {"rows": [row("noise", 29.0)]})
-    assert [cells[1] for cells in alone] == ["31.0 dB / 0.900", "29.0 dB / 0.900"]
+    _, *alone = tables_flaws.alone(together, {"rows": [row("vignetting", 28.0)]}, {"rows": [row("noise", 29.0)]})
+    assert [cells[1] for cells in alone] == ["31.0 dB / 0.900", "28.0 dB / 0.900", "29.0 dB / 0.900"]
     _, *others = tables_flaws.others({"rows": [*rows, row("flawed", 25.0)]}, {"rows": [row("noise", 29.0)]})
     assert [cells[1] for cells in others] == ["30.0 dB / 0.900", "21.0 dB / 0.900"]
-    _, first, *_ = tables_flaws.recovered({"rows": rows})
+    _, first, *_, last = tables_flaws.recovered({"rows": rows}, {"rows": [row("vignetting", 32.0)]})
+    assert last[0].startswith("all images darkened")
     assert first == ["nothing", "+0.50", "-0.25", "0.10", "0.20", "3.9", "4.0", *["60 %, 90 %"] * 3, "7"]
 
 
 def test_what_was_refused_has_a_row():
     case = {"capture": "walker", "flaw": "masks", "size": 2.0, "seed": 0}
     rows = [{"case": case, "refused": "no", "named": {"masks": False}, "beside": []}]
-    for head, cells in (tables_flaws.scores(rows), tables_flaws.recovered({"rows": rows})):
+    for head, cells in (tables_flaws.scores(rows), tables_flaws.recovered({"rows": rows}, {"rows": []})):
         assert len(cells) == len(head)
         assert cells[0].endswith("twice that")
 

@@ -155,7 +155,7 @@ class TestSections:
             benchmark.SECTIONS, bench, keep=lambda state: kept.append(json.dumps(state, default=np.ndarray.tolist))
         )
         assert result["failed"] == []
-        assert len(kept) == 2 + 4 + 1 + 4 + 6 + 1 + 1 + 1  # after every row
+        assert len(kept) == 2 + 4 + 1 + 4 + 6 + 1 + 4 + 1  # after every row
         walker, _ = result["captures"]["rows"]
         assert [row["frame"] for row in walker["frames"]] == [0, 1]
         assert walker["frames"][0]["surface"]["chamfer_mm"] < 1e-3  # the made-up mesh is the truth
@@ -170,6 +170,7 @@ class TestSections:
             tables.large,
             tables.rade,
             tables.variants,
+            tables.few_cameras,
             tables.strides,
         ):
             head, *rows = function(result)
@@ -177,7 +178,7 @@ class TestSections:
             assert all(len(row) == len(head) for row in rows)
         assert tables.frames_tracked(result) == 2
         assert tables.frames_lost(result) == 0
-        tables.draw(result, result, tmp_path / "chart.png")
+        tables.draw(result, result, result, tmp_path / "chart.png")
         assert (tmp_path / "chart.png").stat().st_size > 10_000
 
     def test_kept_sequences_say_how_they_are_drawn_and_what_they_show(self, bench):
