@@ -403,7 +403,7 @@ class Fitter:
         self._left_out = self.dropout[0]
         is_long = options.color_iterations + options.normal_iterations >= RESET_STEPS
         is_sparse = len(views) < options.reset_below and all(view.alpha is not None for view in views)
-        self._is_reset = not (is_long and is_sparse)
+        self._awaits_reset = is_long and is_sparse
         self._taken = 0
 
     def run(self, progress: StepProgress = no_progress) -> None:
@@ -520,10 +520,10 @@ class Fitter:
         if chosen.hidden_share > 0.0:
             self.parameters.activate()  # the last step may have left some out
             unwanted |= alive & hidden(self._targets.shares(self.parameters.drawn), chosen.hidden_share)
-        if is_late and not self._is_reset:
+        if is_late and self._awaits_reset:
             logit = np.float32(np.log(RESET_OPACITY / (1.0 - RESET_OPACITY)))
             rows["logits"][alive] = np.minimum(rows["logits"][alive], logit)
-            self._is_reset = True
+            self._awaits_reset = False
         changed = refine(rows, alive, unwanted, self._mean_gradients(), chosen.split_fraction)
         self.parameters.set_rows(rows)
         self._adam.restart(changed)
