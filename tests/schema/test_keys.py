@@ -287,10 +287,11 @@ def test_samples_that_are_far_apart_make_no_frames(asset):
 
 
 def test_one_segment_is_in_memory_at_once(tmp_path):
-    """Three times the frames: their times add a fourth to it, and all their arrays would more than double it."""
+    """Three times the frames; so many Gaussians that times of samples, which grow with these, are little beside them."""
 
     def lazy(frames):
-        some = list(take(10))
+        rows, ids = np.arange(300) % 6, np.arange(300)
+        some = [cloud.select(rows).with_arrays(ids=ids) for cloud in take(10)]
         return GaussianSequence(frame_count=frames, read_frame=lambda k: some[k % 10], topology="constant")
 
     peaks = []
@@ -300,7 +301,7 @@ def test_one_segment_is_in_memory_at_once(tmp_path):
         write_asset(lazy(frames), tmp_path / "a.usda", segment_length=10, bounds=BOUNDS)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < 1.5 * peaks[0]
+    assert peaks[1] < 1.2 * peaks[0]
 
 
 def test_a_reader_of_1_2_reads_the_same_frames(tmp_path, monkeypatch):
