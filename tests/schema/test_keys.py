@@ -287,7 +287,7 @@ def test_samples_that_are_far_apart_make_no_frames(asset):
 
 
 def test_one_segment_is_in_memory_at_once(tmp_path):
-    """Three times the frames; so many Gaussians that times of samples, which grow with these, are little beside them."""
+    """Three times the frames; so many Gaussians that times of samples, which grow with frames, are little beside."""
 
     def lazy(frames):
         rows, ids = np.arange(300) % 6, np.arange(300)
