@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from beam_warp._version import __version__
@@ -65,6 +66,9 @@ COMMANDS = {
 STEP_MODULES = ("beam_warp.decomposition.work", "beam_warp.reconstruction.steps")
 """What processes need for steps of reconstruction and materials."""
 
+GPU_DRIVERS = ("/dev/nvidiactl", "/dev/dxg")
+"""What there is where CUDA may be: its driver, or that of Windows' subsystem for Linux."""
+
 MOVED = {("render", "--channel"): "beam channel ASSET NAME --out FILE"}
 """Options that became commands of their own."""
 
@@ -82,13 +86,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(lambda: _run(words[0], words[1:]))
 
 
-def _workers(words: Sequence[str]) -> str:
-    """Return who is to work, before options are read."""
-    for given, following in zip(words, [*words[1:], ""], strict=True):
-        name, _, value = given.partition("=")
-        if name == "--workers":
-            return value or following
-    return "1"
+def _forks(words: Sequence[str]) -> bool:
+    """Return whether several processes of this machine are to work, before options are read: a guess, for speed."""
+    given = dict.fromkeys(("--workers", "--device"), "")
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        name, _, value = word.partition("=")
+        if name in given:
+            given[name] = value or following
+    if given["--workers"] in ("", "auto"):
+        return given["--device"] != "cpu" and any(Path(driver).exists() for driver in GPU_DRIVERS)
+    return given["--workers"] != "1"
 
 
 def _run(word: str, words: list[str]) -> int:
@@ -98,7 +105,7 @@ def _run(word: str, words: list[str]) -> int:
     for (command, option), now in MOVED.items():
         if word == command and any(given.split("=")[0] == option for given in words):
             raise InvalidOptionError(f"{option[2:]} must be drawn by a command of its own. Use {now}.")
-    if word in ("run", "reconstruct") and _workers(words) != "1":
+    if word in ("run", "reconstruct") and _forks(words):
         serve(STEP_MODULES)  # it imports while this process does
     record, function = COMMANDS[word].load(word)
     with options_named(record):

@@ -18,7 +18,7 @@ from beam_warp.cli.common.flags import Device, Json, Quiet, Seed, Workers
 from beam_warp.cli.common.pages import SECOND_PAGE
 from beam_warp.cli.common.targets import TargetFlags, state
 from beam_warp.errors import InvalidOptionError
-from beam_warp.plan.crew import crew_of
+from beam_warp.plan.crew import AUTO, crew_of
 from beam_warp.study.table import Settings
 from beam_warp.study.targets import Rung, Target, cheapest, climbed, fitted, in_words
 from beam_warp.world.environment import EnvironmentMap
@@ -89,7 +89,7 @@ class Reconstruct:
     out: Annotated[Path, arg(metavar="DIR", help="Folder for the results.")]
     modelling: OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
     targets: OmitArgPrefixes[TargetFlags] = field(default_factory=TargetFlags)
-    workers: Workers = "1"
+    workers: Workers = AUTO
     seed: Seed = 0
     device: Device = None
     quiet: Quiet = False

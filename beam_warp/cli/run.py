@@ -31,7 +31,7 @@ from beam_warp.cli.decompose import (
 from beam_warp.cli.reconstruct import Asked, Modelling, modelling_for, options_of, steps_of, summary, with_modelling
 from beam_warp.converters.numbering import SOG_NAMES, holds_gaussians
 from beam_warp.errors import InvalidOptionError, MissingFileError
-from beam_warp.plan.crew import crew_of
+from beam_warp.plan.crew import AUTO, crew_of
 from beam_warp.study.targets import Target
 from beam_warp.world.environment import EnvironmentMap
 
@@ -75,7 +75,7 @@ class Run:
     fps: Annotated[float | None, arg(metavar="RATE", help="Frames per second; else the input's word, else 30.")] = None
     keyed: Annotated[Keyed, SECOND_PAGE] = False
     error_scale: Annotated[float, arg(metavar="X", help="With --keyed: multiply all bounds."), SECOND_PAGE] = 1.0
-    workers: Workers = "1"
+    workers: Workers = AUTO
     seed: Seed = 0
     drop_invalid: Annotated[DropInvalid, SECOND_PAGE] = False
     device: Device = None

@@ -129,6 +129,7 @@ class TorchRasterizer:
                 normals=normals,
                 options=options,
                 device=self._warp_device,
+                checkpoints=True,
             )
 
     def __del__(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.plan.steps import Plan
@@ -11,7 +12,11 @@ from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process
 MOST_PROCESSES = 256
 """Processes of one machine, at most."""
 
-GPUS, RAY = "gpus", "ray"
+AUTO, GPUS, RAY = "auto", "gpus", "ray"
+
+SHARING = 2
+"""Processes that share a GPU unless the caller says how many: one follows a segment from frame to frame, and the other
+one does what it leaves."""
 
 
 def crew_of(words: str, device: str | None) -> Crew:
@@ -20,13 +25,19 @@ def crew_of(words: str, device: str | None) -> Crew:
     Args:
         words: A number of processes; ``gpus`` for one on each GPU; ``ray`` for the Ray cluster that this machine is in;
             ``ray://HOST:PORT`` for one that is reached as a Ray client. With a number before, ``3@gpus`` or ``3@ray``,
-            so many share each GPU.
+            so many share each GPU. ``auto``: `SHARING` processes on one GPU, or this process where there is none.
         device: The device that steps are told to use; None lets every worker have its own.
 
     Raises:
         InvalidOptionError: They mean nothing, or contradict the device.
         MissingPackageError: Ray is not installed.
     """
+    if words == AUTO:
+        return lambda plan, kind, progress: (
+            _processes(plan, kind, SHARING, device, visible_gpus()[:1])
+            if kind == "cuda"
+            else in_process(plan, kind, progress)
+        )
     shared, at, place = words.rpartition("@")
     each = int(shared) if shared.isdecimal() and len(shared) < 4 else 0 if at else 1
     if each and (place == RAY or place.startswith(f"{RAY}:")):
@@ -36,15 +47,15 @@ def crew_of(words: str, device: str | None) -> Crew:
     if each and place == GPUS:
         if device is not None:
             raise InvalidOptionError(f"device must be left out with workers gpus, got {device}. Drop one of them.")
-        return lambda plan, kind, progress: _processes(plan, kind, each * len(visible_gpus()), device)
+        return lambda plan, kind, progress: _processes(plan, kind, each * len(visible_gpus()), device, visible_gpus())
     if not (words.isdecimal() and 1 <= int(words) <= MOST_PROCESSES):
         raise InvalidOptionError(
-            f"workers must be a number from 1 to {MOST_PROCESSES}, gpus, ray or ray://HOST:PORT, got {words}. "
+            f"workers must be auto, a number from 1 to {MOST_PROCESSES}, gpus, ray or ray://HOST:PORT, got {words}. "
             "Write 4 for four processes, or 3@gpus for three on each GPU."
         )
     if int(words) == 1:
         return in_process
-    return lambda plan, kind, progress: _processes(plan, kind, int(words), device)
+    return lambda plan, kind, progress: _processes(plan, kind, int(words), device, visible_gpus())
 
 
 def visible_gpus() -> list[str]:
@@ -55,9 +66,9 @@ def visible_gpus() -> list[str]:
     return named[: cuda_device_count()] or [str(number) for number in range(cuda_device_count())]
 
 
-def _processes(plan: Plan, kind: str, count: int, device: str | None) -> Workers:
-    """Return processes that share GPUs evenly, or on a CPU its cores."""
-    count, gpus = min(count, len(plan.steps)), visible_gpus()
+def _processes(plan: Plan, kind: str, count: int, device: str | None, gpus: Sequence[str]) -> Workers:
+    """Return processes that share some GPUs evenly, or on a CPU its cores."""
+    count = min(count, len(plan.steps))
     if count == 0 or (kind == "cuda" and not gpus):
         raise InvalidOptionError("workers must be a number on a machine without GPUs, got gpus. Write 2.")
     settings: list[dict[str, str]] = [{} for _ in range(count)]

@@ -62,15 +62,19 @@ class BackwardBuffers:
         drawn = self._drawn
         if not drawn.pair_capacity:
             return
-        differentiate = launch_composite_adjoint_cuda if drawn.device.is_cuda else launch_composite_adjoint_cpu
         upstream = Adjoints()
         upstream.alpha, upstream.depth = self.images.alpha, self.images.depth
         upstream.median_depth = self.images.median_depth
-        for rows, adjoint, sums in zip(drawn.rows, self._adjoints, self._sums, strict=True):
+        for i, (rows, adjoint, sums) in enumerate(zip(drawn.rows, self._adjoints, self._sums, strict=True)):
             pairs = drawn.pair_rows(sums.shape[1])
-            arguments = (drawn.frame, rows.vectors, drawn.exact, drawn.drawn, adjoint.vectors, upstream)
+            frame = (drawn.frame, rows.vectors, drawn.exact, drawn.drawn)
             drawn.begin_sums()
-            differentiate(*arguments, pairs.vectors, drawn.device)
+            if drawn.device.is_cuda:
+                image, passed = drawn.channel_images[i].vectors, (drawn.checkpoints, drawn.passed[i].vectors)
+                backwards = (image, adjoint.vectors, upstream, *passed, pairs.vectors)
+                launch_composite_adjoint_cuda(*frame, *backwards, drawn.device)
+            else:
+                launch_composite_adjoint_cpu(*frame, adjoint.vectors, upstream, pairs.vectors, drawn.device)
             upstream = Adjoints()  # alpha and depth are drawn in every pass; what they say counts once
             launch_sum_pairs(sums.size, pairs.matrix, drawn.frame.lists, drawn.order, sums, drawn.device)
 

@@ -8,12 +8,13 @@ import numpy as np
 import warp as wp
 
 from beam_warp.errors import InvalidOptionError
-from beam_warp.kernels.raster.bin_tiles import PairList, SplatOrder, TileLists
+from beam_warp.kernels.raster.bin_tiles import TILE, PairList, SplatOrder, TileLists
 from beam_warp.kernels.raster.channel_rows import ChannelBlocks
-from beam_warp.kernels.raster.composite import Images, RasterFrame
+from beam_warp.kernels.raster.composite import Checkpoints, Images, RasterFrame
+from beam_warp.kernels.raster.composite_cuda import STRIDE
 from beam_warp.kernels.raster.project import Projection, RasterView, Splats
 from beam_warp.kernels.raster.tile_lists_cuda import SPREAD
-from beam_warp.raster.layout import ChannelRanges, Rows, ViewLayout, channel_rows
+from beam_warp.raster.layout import ChannelRanges, Rows, ViewLayout, channel_rows, pass_lengths
 from beam_warp.raster.records import RasterImages, RasterOptions
 from beam_warp.world.camera import Camera
 
@@ -41,6 +42,8 @@ class FrameBuffers:
         drawn: Images besides channels, for kernels.
         channel_images: Images of channels, a pass each.
         images: The same images for callers.
+        checkpoints: What pixels have come to on their way through long lists, on CUDA; empty unless asked for.
+        passed: Sums of channels at checkpoints, a pass each.
     """
 
     def __init__(
@@ -51,6 +54,8 @@ class FrameBuffers:
         options: RasterOptions,
         device: wp.Device,
         images_of: FrameBuffers | None,
+        *,
+        checkpoints: bool,
     ) -> None:
         """Allocate everything, without room for pairs.
 
@@ -63,6 +68,7 @@ class FrameBuffers:
         self.channels = channels
         self.device = device
         self.exact = options.depth == "exact"
+        self._has_checkpoints = checkpoints and device.is_cuda
         if images_of is not None:
             self._require_room(images_of)
         with wp.ScopedDevice(device):
@@ -106,8 +112,18 @@ class FrameBuffers:
                 lists.entries, lists.parted = (wp.zeros(capacity, dtype=wp.uint64) for _ in range(2))
                 lists.owners = self.pairs.owners
                 lists.summed = wp.zeros(capacity, dtype=wp.uint8)
+            self._reserve_checkpoints(capacity)
         self.frame.lists = lists
         self._pair_rows: dict[int, Rows] = {}
+
+    def _reserve_checkpoints(self, capacity: int) -> None:
+        """Make room for checkpoints of so many pairs, if there are to be any."""
+        count = capacity // int(STRIDE) + 1 if self._has_checkpoints else 0
+        self.checkpoints = Checkpoints()
+        self.checkpoints.tiles = wp.zeros(count, dtype=int)
+        self.checkpoints.states = wp.zeros(count * TILE * TILE, dtype=wp.vec4)
+        lengths = pass_lengths(self.channels.count)
+        self.passed = [Rows.zeros(count * TILE * TILE, length, self.device) for length in lengths]
 
     def pair_rows(self, length: int) -> Rows:
         """Return rows of that length for all pairs, allocated when first asked for and shared by all that use them."""

@@ -159,6 +159,11 @@ def list_pairs(buffers: FrameBuffers) -> None:
 
 def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) -> None:
     """Draw the tiles of the band that was listed last, with the composite of the device or another launcher."""
-    draw = draw or (launch_composite_cuda if buffers.device.is_cuda else launch_composite_cpu)
-    for rows, image in zip(buffers.rows, buffers.channel_images, strict=True):
-        draw(buffers.frame, rows.vectors, buffers.exact, image.vectors, buffers.drawn, buffers.device)
+    buffers.checkpoints.tiles.zero_()
+    for rows, image, passed in zip(buffers.rows, buffers.channel_images, buffers.passed, strict=True):
+        frame, drawn = (buffers.frame, rows.vectors, buffers.exact), (image.vectors, buffers.drawn)
+        if draw is None and buffers.device.is_cuda:
+            notes, colored = (buffers.checkpoints, passed.vectors), buffers.channels.count > 0
+            launch_composite_cuda(*frame, colored, *drawn, *notes, buffers.device)
+        else:
+            (draw or launch_composite_cpu)(*frame, *drawn, buffers.device)

@@ -58,6 +58,7 @@ class Rasterizer:
         options: RasterOptions | None = None,
         device: Any = None,
         images_of: Rasterizer | None = None,
+        checkpoints: bool = False,
     ) -> None:
         """Allocate the arrays of every frame.
 
@@ -72,6 +73,9 @@ class Rasterizer:
             images_of: Another rasteriser on the device, of as many channels and of at least as many pixels, to draw
                 into the first of its pixels instead of images of its own. What either shows, and what `backward` and
                 `back_project` start from, lasts until the other draws.
+            checkpoints: Whether `draw` notes on CUDA what pixels have come to on their way through long lists, so that
+                `backward` can share these out: faster where images are small, for 16 bytes more a pair and 4 for each
+                channel.
 
         Raises:
             DeviceError: There is no such device.
@@ -88,7 +92,8 @@ class Rasterizer:
         )
         self.color_channels, self.normal_channels, self.value_channels = channels
         room = None if images_of is None else images_of._buffers
-        self._buffers = FrameBuffers(self._count, self.cameras, channels, self.options, self.device, room)
+        frame = (self._count, self.cameras, channels, self.options, self.device, room)
+        self._buffers = FrameBuffers(*frame, checkpoints=checkpoints)
         self.images = self._buffers.images
         self.gaussian_ids = self._buffers.drawn.gaussians
         self._gaussians: GaussianArrays | None = None

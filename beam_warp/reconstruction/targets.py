@@ -151,9 +151,8 @@ class ViewTargets:
         self.cameras = cameras
         self._weigher: Rasterizer | None = None
         self._drawn: GaussianArrays | None = None
-        self.rasterizer = Rasterizer(
-            gaussian_count, cameras[:1], radiance=True, normals=True, options=options, device=device
-        )
+        how: dict[str, Any] = {"options": options, "device": device, "checkpoints": True}
+        self.rasterizer = Rasterizer(gaussian_count, cameras[:1], radiance=True, normals=True, **how)
         self.device = self.rasterizer.device
         self._looks = StepGraphs(self.device)
         self.height, self.width = views[0].camera.height, views[0].camera.width

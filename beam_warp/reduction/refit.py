@@ -112,7 +112,8 @@ class _Refit:
         self.slopes = tuple(wp.zeros_like(array) for array in self.changes)
         self._gaussians = GaussianArrays(*(wp.empty_like(array) for array in some[:-1]))
         cameras = [view.camera for view in found.views]
-        self._drawer = Rasterizer(count, cameras[:1], value_count=MATERIALS, options=raster, device=device)
+        how: dict[str, Any] = {"options": raster, "device": device, "checkpoints": True}
+        self._drawer = Rasterizer(count, cameras[:1], value_count=MATERIALS, **how)
         self._cameras = [self._drawer.prepare_cameras([camera]) for camera in cameras]
 
         self.is_whole, self._has_room = True, False

@@ -43,6 +43,17 @@ class Images:
 
 
 @wp.struct
+class Checkpoints:
+    """What pixels have come to after every so many entries of their tile's list, a stride; on CUDA, for the way back.
+
+    The one before entry i of all lists has the place i / stride. Arrays of length 0 stand for none.
+    """
+
+    tiles: wp.array[int]  # whose each is, counted from 1; 0 where no list was gone through so far
+    states: wp.array[wp.vec4]  # transmittance, sums of weights and of weighted depths, 0; pixel by pixel of the tile
+
+
+@wp.struct
 class PixelPlace:
     """Place of a pixel in its view and in the images; ``index`` is -1 outside."""
 

@@ -3,6 +3,10 @@
 The block brings 32 splats at a time to shared memory, back to front. Each warp goes through those that reach its
 pixels, sums over them, and leaves its sums; the block adds those of its warps and stores them in the pair's slot. No
 atomics, one order of additions, the same bits every run.
+
+A small image has fewer tiles than a GPU has room for blocks, and the longest list would say how long it takes. So with
+checkpoints each stride of a list is a block's, which begins with what pixels had come to behind it, as in Mallick et
+al. 2024, Taming 3DGS.
 """
 
 from functools import cache
@@ -25,7 +29,7 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Images, PixelPlace, RasterFrame, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import Checkpoints, Images, PixelPlace, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.composite_adjoint import (
     Adjoints,
     PixelState,
@@ -34,7 +38,7 @@ from beam_warp.kernels.raster.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, reaches
+from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, STRIDE, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, sight_of
 
@@ -75,6 +79,37 @@ def own_pixel(place: PixelPlace, images: Images, adjoints: Adjoints) -> OwnPixel
 
 
 @cache
+def cut_function(channel_count: int):
+    """Return the function that ends a pixel's list where its block's stride ends, if the pixel looked further."""
+    Channels = channel_vector(channel_count)
+
+    @wp.func
+    def cut(
+        pixel: OwnPixel,
+        stop: int,
+        noted: int,
+        images: Images,
+        drawn: wp.array[Channels],
+        to_channels: Channels,
+        checkpoints: Checkpoints,
+        passed: wp.array[Channels],
+    ) -> OwnPixel:
+        if pixel.end > stop:
+            i = pixel.index
+            held = checkpoints.states[noted]
+            adjoint = pixel.state.adjoint
+            behind = wp.dot(drawn[i] - passed[noted], to_channels)
+            behind += (images.alpha[i] - held[1]) * adjoint[0]
+            behind += (images.depth[i] * images.alpha[i] - held[2]) * adjoint[1]
+            pixel.state.behind = behind
+            pixel.state.transmittance = held[0]
+            pixel.end = stop
+        return pixel
+
+    return cut
+
+
+@cache
 def share_splat_function(channel_count: int, exact: bool):
     """Return the function that brings a splat to shared memory, a part of it by each warp."""
     Channels = channel_vector(channel_count)
@@ -99,13 +134,14 @@ def share_splat_function(channel_count: int, exact: bool):
 
 @cache
 def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
-    """Return the kernel that writes the moments and channels of every pair, a block a tile."""
+    """Return the kernel that writes the moments and channels of every pair, a block a tile or a stride of its list."""
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     add_pixel = add_pixel_function(channel_count, exact)
     share_row = share_row_function(4 if exact else 3, LANES)
     share_channels = share_channels_function(Channels, LANES)
     share_splat = share_splat_function(channel_count, exact)
+    cut = cut_function(channel_count)
     sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -114,38 +150,58 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         frame: RasterFrame,
         channels: wp.array[Channels],
         images: Images,
+        drawn_channels: wp.array[Channels],
         channel_adjoints: wp.array[Channels],
         adjoints: Adjoints,
+        checkpoints: Checkpoints,
+        passed: wp.array[Channels],
         out_pairs: wp.array[Pair],
     ):
         item = first + wp.tid()
         thread = item % THREADS
         lane = item % LANES
         part = thread / LANES
-        listed = frame.lists.order[item / THREADS]
+        block = item / THREADS
+        tile_count = frame.band.end_tile - frame.band.first_tile
+        listed = int(0)
+        begin = int(0)
+        if block < tile_count:
+            listed = frame.lists.order[block]
+            begin = frame.lists.ranges[listed][0]
+        else:
+            checkpoint = block - tile_count
+            listed = checkpoints.tiles[checkpoint] - 1
+            if listed < 0:  # all threads of the block alike
+                return
+            begin = checkpoint * STRIDE + frame.lists.ranges[listed][0] % STRIDE
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        listed_range = frame.lists.ranges[listed]
         corner = (part / 2) * PART * SIDE + (part % 2) * PART
         box = pixel_place(view, tile, corner)
         own = corner + (lane / PART) * SIDE + lane % PART
         upper = own_pixel(pixel_place(view, tile, own), images, adjoints)
         lower = own_pixel(pixel_place(view, tile, own + SIDE * PART / 2), images, adjoints)
-        upper_state = upper.state
-        lower_state = lower.state
         to_upper = Channels()
         to_lower = Channels()
         if upper.index >= 0:
             to_upper = channel_adjoints[upper.index]
         if lower.index >= 0:
             to_lower = channel_adjoints[lower.index]
+        if checkpoints.tiles.shape[0] > 0:
+            stop = begin + STRIDE
+            noted = stop / STRIDE * SIDE * SIDE + own
+            upper = cut(upper, stop, noted, images, drawn_channels, to_upper, checkpoints, passed)
+            noted += SIDE * PART / 2
+            lower = cut(lower, stop, noted, images, drawn_channels, to_lower, checkpoints, passed)
+        upper_state = upper.state
+        lower_state = lower.state
         own_end = greatest_of_lanes(wp.max(upper.end, lower.end))
         end = greatest_of_block(own_end)
-        while end > listed_range[0]:
+        while end > begin:
             mine = end - 1 - lane
             slot = int(-1)
             splat = int(-1)
-            if mine >= listed_range[0]:
+            if mine >= begin:
                 slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
                 share_splat(part, lane, frame, channels, splat)
@@ -197,12 +253,15 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     return composite_blocks_adjoint_kernel
 
 
-def launch_composite_adjoint_cuda(frame, channels, exact, images, channel_adjoints, adjoints, out_pairs, device):
+def launch_composite_adjoint_cuda(
+    frame, channels, exact, images, drawn_channels, channel_adjoints, adjoints, checkpoints, passed, out_pairs, device
+):
     """Write the moments and channels of a band's pairs into their slots."""
+    drawn = [images, drawn_channels]
     launch(
         composite_adjoint_cuda_kernel(channels.dtype._length_, exact),
-        (frame.band.end_tile - frame.band.first_tile) * THREADS,
-        inputs=[frame, channels, images, channel_adjoints, adjoints],
+        (frame.band.end_tile - frame.band.first_tile + len(checkpoints.tiles)) * THREADS,
+        inputs=[frame, channels, *drawn, channel_adjoints, adjoints, checkpoints, passed],
         outputs=[out_pairs],
         device=device,
         block_dim=32 * WARPS,

@@ -21,7 +21,7 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import Checkpoints, Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
     EXTENT_MARGIN,
@@ -42,6 +42,9 @@ LANES = wp.constant(32)
 WIDTH = wp.constant(8)
 HEIGHT = wp.constant(4)
 """Pixels of a warp."""
+
+STRIDE = THREADS
+"""Entries of a list between two checkpoints: those that are brought to shared memory at a time."""
 
 BLOCKS = 4
 """Blocks that a multiprocessor should hold at least: they limit registers."""
@@ -80,8 +83,11 @@ def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, width: int, height:
 
 
 @cache
-def composite_cuda_kernel(channel_count: int, exact: bool):
-    """Return the kernel that composites ``channel_count`` channels, an item a pixel."""
+def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True):
+    """Return the kernel that composites ``channel_count`` channels, an item a pixel; unless ``colored``, none of them.
+
+    Shadow maps show depth alone. Channels then stay what they were: 0.
+    """
     Channels = channel_vector(channel_count)
     depth_at = limited_depth_function(exact)
     share_row = share_row_function(4 if exact else 3, THREADS)
@@ -94,6 +100,8 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
         channels: wp.array[Channels],
         out_channels: wp.array[Channels],
         out_images: Images,
+        out_checkpoints: Checkpoints,
+        out_passed: wp.array[Channels],
     ):
         item = first + wp.tid()
         thread = item % THREADS
@@ -104,7 +112,8 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
         part = thread / LANES
         corner = part / (SIDE / WIDTH) * HEIGHT * SIDE + part % (SIDE / WIDTH) * WIDTH
         box = pixel_place(view, tile, corner).position
-        place = pixel_place(view, tile, corner + lane / WIDTH * SIDE + lane % WIDTH)
+        within = corner + lane / WIDTH * SIDE + lane % WIDTH
+        place = pixel_place(view, tile, within)
         pixel = place.index
         total = Channels()
         depth = float(0.0)
@@ -130,9 +139,19 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
                     frame.lists.splats,
                     frame.lists.slots,
                 )
+            count = wp.min(sorted_end - begin, THREADS)
+            if out_checkpoints.tiles.shape[0] > 0:
+                strayed = (begin - listed_range[0]) % STRIDE
+                if strayed != 0:  # by the end of what was sorted: the next stride begins as it should
+                    count = wp.min(count, STRIDE - strayed)
+                elif begin > listed_range[0]:
+                    row = begin / STRIDE * SIDE * SIDE + within
+                    out_checkpoints.tiles[begin / STRIDE] = listed + 1
+                    out_checkpoints.states[row] = wp.vec4(transmittance, weight_sum, depth, 0.0)
+                    out_passed[row] = total
             splat = int(-1)
             center = NOWHERE
-            if begin + thread < sorted_end:
+            if thread < count:
                 splat = frame.lists.splats[begin + thread]
             if splat >= 0:
                 center = load_row(frame.splats.centers, splat)
@@ -145,11 +164,12 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
                     slope = wp.vec4(slope[0], slope[1], limits[0], limits[1])
                 share_row(1, SHAPE, thread, shape)
                 share_row(1, SLOPE, thread, slope)
-                share_channels(1, thread, channels, splat)
+                if wp.static(colored):
+                    share_channels(1, thread, channels, splat)
             share_row(1, CENTER, thread, center)
             wait_for_block()
             group = int(0)
-            while group < wp.min(sorted_end - begin, THREADS):
+            while group < count:
                 waiting = int(0)
                 if ballot(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) != 0:
                     found = share_row(0, CENTER, group + lane, wp.vec4())
@@ -172,7 +192,8 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
                     if wp.static(exact):
                         bounds = share_row(0, BEND, i, wp.vec4())
                     z = depth_at(drawn[3], wp.vec2(bounds[2], bounds[3]), slope, bounds[0], offset)
-                    total += share_channels(0, i, channels, 0) * weight
+                    if wp.static(colored):
+                        total += share_channels(0, i, channels, 0) * weight
                     depth += z * weight
                     weight_sum += weight
                     last = wp.where(seen, begin + i, last)
@@ -181,7 +202,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
                     median = wp.where(nearer, begin + i, median)
                     transmittance *= 1.0 - alpha
                 group += LANES
-            begin = wp.min(begin + THREADS, sorted_end)
+            begin += count
             if any_of_block(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) == 0:
                 begin = listed_range[1]
         if pixel >= 0:
@@ -190,7 +211,8 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
             if last >= 0:
                 gaussian = frame.lists.splats[last] % frame.gaussian_count
                 end = last + 1
-            out_channels[pixel] = total
+            if wp.static(colored):
+                out_channels[pixel] = total
             out_images.alpha[pixel] = weight_sum
             out_images.transmittance[pixel] = transmittance
             out_images.depth[pixel] = wp.where(weight_sum > 0.0, depth / weight_sum, 0.0)
@@ -202,13 +224,15 @@ def composite_cuda_kernel(channel_count: int, exact: bool):
     return composite_blocks_kernel
 
 
-def launch_composite_cuda(frame, channels, exact, out_channels, out_images, device):
-    """Composite a band on a CUDA device."""
+def launch_composite_cuda(
+    frame, channels, exact, colored, out_channels, out_images, out_checkpoints, out_passed, device
+):
+    """Composite a band on a CUDA device; checkpoints get their sums of channels in ``out_passed``."""
     launch(
-        composite_cuda_kernel(channels.dtype._length_, exact),
+        composite_cuda_kernel(channels.dtype._length_, exact, colored),
         (frame.band.end_tile - frame.band.first_tile) * SIDE * SIDE,
         inputs=[frame, channels],
-        outputs=[out_channels, out_images],
+        outputs=[out_channels, out_images, out_checkpoints, out_passed],
         device=device,
         block_dim=THREADS,
     )

@@ -14,6 +14,7 @@ from support.raster_clouds import around, cloud, drawn, set_upstream
 from beam_warp import GaussianCloud, rasterize
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.raster.composite_cuda import STRIDE
 from beam_warp.raster import forward, rasterizer
 from beam_warp.raster.gbuffer import rasterize_backward
 from beam_warp.raster.rasterizer import Rasterizer
@@ -208,6 +209,25 @@ def test_bands_change_no_image_and_hardly_a_gradient(device, made, values, monke
     assert_same(found[0][:5], found[1][:5])
     for one, other in zip(found[0][5:], found[1][5:], strict=True):
         assert np.linalg.norm(one - other) <= 1e-6 * np.linalg.norm(one)
+
+
+@pytest.mark.parametrize(("opacities", "depth"), [((0.004, 0.05), "exact"), ((0.05, 0.95), "plane")])
+def test_checkpoints_change_no_image_and_hardly_a_gradient(device, rng, opacities, depth):
+    """Of lists of several strides: pixels that see all of them, and some that stop anywhere."""
+    made = cloud(rng, 6_000).with_arrays(opacities=rng.uniform(*opacities, 6_000).astype(np.float32))
+    values = rng.uniform(0, 1, (6_000, 19)).astype(np.float32)
+    cameras, options = [around(33, 20), around(17, 30, 80.0)], RasterOptions(depth=depth)
+    found = []
+    for checkpoints in (False, True):
+        drawer, _ = drawn(made, cameras, device, values, options=options, checkpoints=checkpoints)
+        assert drawer.pair_count() > 4 * int(STRIDE) * 10  # tiles
+        filled(np.random.default_rng(1), drawer)
+        found.append(state(drawer))
+        drawer.redraw()
+        assert_same(found[-1], state(drawer))
+    assert_same(found[0][:6], found[1][:6])
+    for one, other in zip(found[0][6:], found[1][6:], strict=True):
+        assert np.linalg.norm(one - other) <= 1e-5 * np.linalg.norm(one)
 
 
 @pytest.mark.parametrize("limit", [2**24, 300])

@@ -31,6 +31,7 @@ class Drawn:
                 antialiased=scene.antialiased, low_pass=scene.low_pass, near=scene.near, depth=scene.depth_mode
             ),
             device=device,
+            checkpoints=True,
         )
         kinds = {"positions": wp.vec3, "orientations": wp.quat, "scales": wp.vec3, "opacities": float, "values": float}
         arrays = {name: array.astype(np.float32) for name, array in scene.arrays().items()}

@@ -34,7 +34,11 @@ MetersPerUnit = Annotated[
 ]
 DropInvalid = Annotated[bool, arg(help="Leave out rows with NaN or zero quaternions, and say how many.")]
 Workers = Annotated[
-    str, arg(metavar="N|gpus|3@gpus|ray://…", help="Who works: N processes, one (or 3) on each GPU, or a Ray cluster.")
+    str,
+    arg(
+        metavar="auto|N|gpus|3@gpus|ray://…",
+        help="Who works: N processes, one (or 3) on each GPU, or a Ray cluster; by default two on the GPU.",
+    ),
 ]
 Keyed = Annotated[bool, arg(help="USD: time samples only where frames between them are not within bounds.")]
 Seed = Annotated[int, arg(help="Same seed, same device: same result.")]
