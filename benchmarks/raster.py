@@ -339,6 +339,32 @@ def measure_variants(effort: Effort, device: Any) -> Row:
     return found
 
 
+def measure_checkpoints(effort: Effort, device: Any) -> Row:
+    """Time the way back with and without checkpoints, from small images to large ones, and compare the gradients."""
+    rows: list[Row] = []
+    for side in effort.sizes[:-1]:
+        for make in (figure, cube):
+            scene = make(effort.gaussians, *side)
+            values = np.ascontiguousarray(scene.values()[:, :6])
+            drawings = {kept: Drawing(scene, device, values=values, checkpoints=kept) for kept in (False, True)}
+            found = {kept: drawing.gradients() for kept, drawing in drawings.items()}
+            parts = {
+                f"{name} {kept}": Clocked.on(device, captured(getattr(drawing, name), device))
+                for kept, drawing in drawings.items()
+                for name in ("forward", "backward")
+            }
+            measured = measure_in_turn(parts, effort.repeats, device)
+            entry: Row = {"scene": describe(scene), "pairs": drawings[True].rasterizer.pair_count()}
+            for name in ("forward", "backward"):
+                ways = {"whole": measured[f"{name} False"], "shared": measured[f"{name} True"]}
+                entry[name] = {way: timed.summary() for way, timed in ways.items()}
+            entry["gradients"] = {
+                name: relative_l2(np.asarray(found[True][name]), np.asarray(found[False][name])) for name in found[True]
+            }
+            rows.append(entry)
+    return {"channels": values.shape[1], "rows": rows}
+
+
 def sampled_pixels(seen: Seen, count: int) -> NDArray[np.int64]:
     """Return some pixels that see something, half of them where the coverage is partial, as at silhouettes."""
     even = np.flatnonzero(seen.alpha > 1e-3)
@@ -492,7 +518,7 @@ def sections(effort: Effort, device: Any) -> dict[str, Callable[[Any], Iterator[
         "growth": measure_growth,
     }
     if device.is_cuda:
-        found = {"peer": measure_peer, **found}
+        found = {"peer": measure_peer, **found, "checkpoints": measure_checkpoints}
     return {name: once(partial(section, effort)) for name, section in found.items()}
 
 

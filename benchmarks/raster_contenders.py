@@ -54,6 +54,7 @@ class Drawing:
         normals: Whether the normals of the geometry are composited.
         options: Of the rasteriser.
         readable: Whether the oracle composites.
+        checkpoints: Whether the way back shares out long lists.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class Drawing:
         normals: bool = False,
         options: RasterOptions | None = None,
         readable: bool = False,
+        checkpoints: bool = False,
     ) -> None:
         values = scene.values() if values is None else values
         self.device = device
@@ -77,6 +79,7 @@ class Drawing:
             normals=normals,
             options=options,
             device=device,
+            checkpoints=checkpoints,
         )
         self.channel_count = self.rasterizer.value_channels.stop
         self.gaussians = upload_gaussians(scene.cloud, device, values=values, radiance=radiance)

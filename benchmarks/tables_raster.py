@@ -79,6 +79,21 @@ def frames(result: Row, on_cpu: Row) -> Rows:
     return rows
 
 
+@table("raster_checkpoints", H200)
+def checkpoints(result: Row) -> Rows:
+    """Return the time of the way back, lists whole and shared out."""
+    rows = [
+        ["scene", "pairs", "forward [ms]", "with checkpoints", "backward", "with checkpoints", "gradients differ by"]
+    ]
+    for entry in result["checkpoints"]["rows"]:
+        scene = entry["scene"]
+        name = f"{scene['name']}, {scene['width']} × {scene['height']}"
+        ways = [entry[part][way]["device_ms"] for part in ("forward", "backward") for way in ("whole", "shared")]
+        times = (cell(way, ".2f") for way in ways)
+        rows.append([name, f"{entry['pairs']:,}", *times, f"{max(entry['gradients'].values()):.0e}"])
+    return rows
+
+
 @table("raster_gradients", "raster_gradients_h200.json", "raster_gradients_cpu.json")
 def gradients(result: Row, on_cpu: Row) -> Rows:
     """Return the largest error of every scene, over arrays and kinds of depth."""

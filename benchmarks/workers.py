@@ -37,7 +37,7 @@ from timing import spread
 from beam_warp.demo.capture import DANCE_SECONDS, FRAMES_PER_SECOND, demo_figure_for, dome_cameras, write_capture
 from beam_warp.demo.lights import studio
 from beam_warp.device.arrays import resolve_device
-from beam_warp.plan.crew import visible_gpus
+from beam_warp.plan.crew import AUTO, GPUS, SHARING, visible_gpus
 from beam_warp.plan.standing import look
 from beam_warp.plan.steps import Rank
 
@@ -107,8 +107,8 @@ class Bench:
         first = min(receipt.ended - receipt.seconds for receipt in receipts)
         last = max(receipt.ended for receipt in receipts)
         each, _, place = workers.rpartition("@")
-        count = int(each or 1) * len(visible_gpus()) if place == "gpus" else int(workers)
-        gpus = max(min(count, len(visible_gpus())), 1)
+        count = int(each or 1) * len(visible_gpus()) if place == GPUS else SHARING if workers == AUTO else int(workers)
+        gpus = 1 if workers == AUTO else max(min(count, len(visible_gpus())), 1)
         times = dict[str, list[float]]()
         for step in standing.steps:
             kind = "key frame" if step.rank == Rank.KEY_FRAME else step.stage

@@ -79,8 +79,8 @@ class TestReconstruct:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("reconstruct {folder} --workers some", "workers must be a number from 1 to 256, gpus, ray or ray://HOST:PORT"),
-        ("reconstruct {folder} --workers 0", "workers must be a number"),
+        ("reconstruct {folder} --workers some", "workers must be auto, a number from 1 to 256, gpus, ray or ray://"),
+        ("reconstruct {folder} --workers 0", "workers must be auto, a number"),
         ("reconstruct {folder} --workers 0@gpus", "got 0@gpus. Write 4 for four processes, or 3@gpus"),
         ("reconstruct {folder} --workers 3@4", "ray or ray://HOST:PORT, got 3@4"),
         ("reconstruct {folder} --workers gpus --device cpu", "device must be left out with workers gpus, got cpu"),

@@ -213,7 +213,7 @@ def test_bands_change_no_image_and_hardly_a_gradient(device, made, values, monke
 
 @pytest.mark.parametrize(("opacities", "depth"), [((0.004, 0.05), "exact"), ((0.05, 0.95), "plane")])
 def test_checkpoints_change_no_image_and_hardly_a_gradient(device, rng, opacities, depth):
-    """Of lists of several strides: pixels that see all of them, and some that stop anywhere."""
+    """Lists have several strides: some pixels see all of them, others stop anywhere."""
     made = cloud(rng, 6_000).with_arrays(opacities=rng.uniform(*opacities, 6_000).astype(np.float32))
     values = rng.uniform(0, 1, (6_000, 19)).astype(np.float32)
     cameras, options = [around(33, 20), around(17, 30, 80.0)], RasterOptions(depth=depth)
