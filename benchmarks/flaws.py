@@ -117,7 +117,8 @@ def measure(clean: Capture, name: str, size: float, seed: int, arguments: argpar
     written = time.perf_counter()
     out = folder / "out"
     modelling = Modelling(gaussians=arguments.gaussians, preset=arguments.preset)
-    asked = Run(input=copy.capture.folder, out=out, modelling=modelling, seed=seed, device=arguments.device, quiet=True)
+    how = {"seed": seed, "device": arguments.device, "workers": "1", "quiet": True}
+    asked = Run(input=copy.capture.folder, out=out, modelling=modelling, **how)
     row: Row = {"injected": copy.injected, "seconds": {"write": written - started}}
     findings: list[Finding] = []
     try:

@@ -96,7 +96,7 @@ def measure_take(bench: Bench, *, case: bool) -> Iterator[Row]:
     found["seconds_to_path_trace"] = time.perf_counter() - began
     say(f"{name}: path traced")
     out, began = bench.place / f"{name}-asset", time.perf_counter()
-    run(Run(input=capture.folder, out=out, modelling=bench.modelling, device=bench.device, quiet=True))
+    run(Run(input=capture.folder, out=out, modelling=bench.modelling, workers="1", device=bench.device, quiet=True))
     found["seconds_to_run"] = time.perf_counter() - began
     report = json.loads((out / "reconstruction" / "report.json").read_text(encoding="utf-8"))
     asset = converters.read(out / "asset.usda")
