@@ -25,9 +25,18 @@ class CompilationListener(Protocol):
         """Take how many modules were begun so far, and how long those that are done took together [s]."""
 
 
+_listeners: list[CompilationListener] = []
+
+
+def tell_of_compilation(module_count: int, seconds: float, *, is_running: bool) -> None:
+    """Tell all who listen here of what another process compiles."""
+    for listener in _listeners:
+        listener(module_count, seconds, is_running=is_running)
+
+
 @contextmanager
 def compilation_heard(listener: CompilationListener) -> Iterator[None]:
-    """Tell a listener of every module that is compiled within, in whichever thread."""
+    """Tell a listener of every module that is compiled within, in whichever thread, and of what others tell of."""
     home: Any = getattr(getattr(wp, "_src", None), "build", None)
     usual = {name: getattr(home, name) for name in COMPILERS if hasattr(home, name)}
     lock = threading.Lock()
@@ -52,8 +61,10 @@ def compilation_heard(listener: CompilationListener) -> Iterator[None]:
 
     for name, compile_module in usual.items():
         setattr(home, name, heard(compile_module))
+    _listeners.append(listener)
     try:
         yield
     finally:
+        _listeners.remove(listener)
         for name, compile_module in usual.items():
             setattr(home, name, compile_module)

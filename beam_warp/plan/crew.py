@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 
 from beam_warp.errors import InvalidOptionError
+from beam_warp.jobs.listeners import NotedProgress
 from beam_warp.plan.steps import Plan
 from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process
 
@@ -34,10 +34,8 @@ def crew_of(words: str, device: str | None) -> Crew:
     """
     if words == AUTO:
         return lambda plan, kind, progress: (
-            _processes(plan, kind, SHARING, device, visible_gpus()[:1])
-            if kind == "cuda"
-            else in_process(plan, kind, progress)
-        )
+            _processes(SHARING, device, gpus=slice(1)) if kind == "cuda" else in_process
+        )(plan, kind, progress)
     shared, at, place = words.rpartition("@")
     each = int(shared) if shared.isdecimal() and len(shared) < 4 else 0 if at else 1
     if each and (place == RAY or place.startswith(f"{RAY}:")):
@@ -47,15 +45,13 @@ def crew_of(words: str, device: str | None) -> Crew:
     if each and place == GPUS:
         if device is not None:
             raise InvalidOptionError(f"device must be left out with workers gpus, got {device}. Drop one of them.")
-        return lambda plan, kind, progress: _processes(plan, kind, each * len(visible_gpus()), device, visible_gpus())
+        return _processes(each, device, on_each=True)
     if not (words.isdecimal() and 1 <= int(words) <= MOST_PROCESSES):
         raise InvalidOptionError(
             f"workers must be auto, a number from 1 to {MOST_PROCESSES}, gpus, ray or ray://HOST:PORT, got {words}. "
             "Write 4 for four processes, or 3@gpus for three on each GPU."
         )
-    if int(words) == 1:
-        return in_process
-    return lambda plan, kind, progress: _processes(plan, kind, int(words), device, visible_gpus())
+    return in_process if int(words) == 1 else _processes(int(words), device)
 
 
 def visible_gpus() -> list[str]:
@@ -66,15 +62,20 @@ def visible_gpus() -> list[str]:
     return named[: cuda_device_count()] or [str(number) for number in range(cuda_device_count())]
 
 
-def _processes(plan: Plan, kind: str, count: int, device: str | None, gpus: Sequence[str]) -> Workers:
-    """Return processes that share some GPUs evenly, or on a CPU its cores."""
-    count = min(count, len(plan.steps))
-    if count == 0 or (kind == "cuda" and not gpus):
-        raise InvalidOptionError("workers must be a number on a machine without GPUs, got gpus. Write 2.")
-    settings: list[dict[str, str]] = [{} for _ in range(count)]
-    for number, setting in enumerate(settings):
-        if kind == "cuda" and device is None:
-            setting["CUDA_VISIBLE_DEVICES"] = gpus[number % len(gpus)]
-        if kind == "cpu":
-            setting["BEAM_WARP_THREADS"] = str(max((os.cpu_count() or 1) // count, 1))
-    return Processes(plan.works, Terms.of(plan.folder, kind), settings)
+def _processes(count: int, device: str | None, *, on_each: bool = False, gpus: slice = slice(None)) -> Crew:
+    """Return processes that share some of the GPUs evenly, or on a CPU its cores; as many on each GPU, if asked for."""
+
+    def crew(plan: Plan, kind: str, progress: NotedProgress) -> Workers:
+        shared = visible_gpus()[gpus]
+        total = min(count * len(shared) if on_each else count, len(plan.steps))
+        if total == 0 or (kind == "cuda" and not shared):
+            raise InvalidOptionError("workers must be a number on a machine without GPUs, got gpus. Write 2.")
+        settings: list[dict[str, str]] = [{} for _ in range(total)]
+        for number, setting in enumerate(settings):
+            if kind == "cuda" and device is None:
+                setting["CUDA_VISIBLE_DEVICES"] = shared[number % len(shared)]
+            if kind == "cpu":
+                setting["BEAM_WARP_THREADS"] = str(max((os.cpu_count() or 1) // total, 1))
+        return Processes(plan.works, Terms.of(plan.folder, kind), settings, progress)
+
+    return crew

@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import connection, forkserver
@@ -42,6 +42,9 @@ UNKNOWN_END = 255
 
 IDLE = 0.25
 """Time without a task after which a process imports what it may need later [s]."""
+
+SPEAKING = 0.2
+"""Least time between two words of a process on how far its step is [s]."""
 
 PAUSES = tuple(0.001 * 2**count for count in range(12))
 """Times to wait before a process is started anew, since the server was killed meanwhile [s].
@@ -69,6 +72,25 @@ class Outcome:
     error: Exception | None = None
     lost: str = ""
     is_own_fault: bool = False
+
+
+@dataclass(frozen=True)
+class StepProgress:
+    """How far a process is within a step: what `NotedProgress` takes."""
+
+    stage: str
+    done: int
+    total: int
+    note: str
+
+
+@dataclass(frozen=True)
+class Compilation:
+    """What a process has compiled, and whether it still does: what `CompilationListener` takes."""
+
+    module_count: int = 0
+    seconds: float = 0.0
+    is_running: bool = False
 
 
 class Workers(Protocol):
@@ -238,19 +260,27 @@ def serve(modules: Sequence[str]) -> None:
 class Processes:
     """Processes of this machine, one for each entry of ``settings``; one that ends is replaced."""
 
-    def __init__(self, works: Mapping[str, Work], terms: Terms, settings: Sequence[Mapping[str, str]]) -> None:
+    def __init__(
+        self,
+        works: Mapping[str, Work],
+        terms: Terms,
+        settings: Sequence[Mapping[str, str]],
+        progress: NotedProgress = no_progress,
+    ) -> None:
         """Start the processes.
 
         Args:
             works: What does the steps of each stage; picklable.
             terms: What each must have.
             settings: Environment variables of each.
+            progress: Told how far steps are: of each stage, the process that spoke of it first.
 
         Raises:
             InvalidOptionError: The work cannot be sent to another process.
         """
         self.count = len(settings)
-        self._terms = terms
+        self._terms, self._progress = terms, progress
+        self._speakers: dict[str, _Member] = {}
         self._context = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
         self._packed = packed(works, terms)
         serve(_modules_of(works))
@@ -322,11 +352,30 @@ class Processes:
             return self._replace(member)
         if isinstance(said, BeamError):  # it cannot do such work, and neither can another one in its place
             raise said
-        if said is not None:
-            member.task = None
+        if isinstance(said, StepProgress):
+            if self._speakers.setdefault(said.stage, member) is member:
+                self._progress(**vars(said))
+        elif isinstance(said, Compilation):
+            member.compilation = said
+            self._tell_of_compilation()
+        elif said is not None:
+            self._done(member)
             return [said]
-        member.is_ready = True
+        else:
+            member.is_ready = True
         return []
+
+    def _done(self, member: _Member) -> None:
+        """Let others speak of the stages of a process that has done its task, or has ended."""
+        member.task = None
+        self._speakers = {stage: speaker for stage, speaker in self._speakers.items() if speaker is not member}
+
+    def _tell_of_compilation(self) -> None:
+        from beam_warp.device.compilation import tell_of_compilation
+
+        found = [member.compilation for member in self._members]
+        count, seconds = sum(it.module_count for it in found), sum(it.seconds for it in found)
+        tell_of_compilation(count, seconds, is_running=any(it.is_running for it in found))
 
     def _replace(self, member: _Member) -> list[Outcome]:
         member.process.kill()
@@ -339,9 +388,11 @@ class Processes:
             raise InvalidOptionError(
                 f"workers must start, got one that ended at once ({_ended(code)}). Try --workers 1 to see why."
             )
-        if member.task is None:
-            return []
-        return [Outcome(member.task.step.name, member.name, lost=_ended(code), is_own_fault=own)]
+        if member.compilation.is_running:
+            self._tell_of_compilation()
+        task = member.task
+        self._done(member)
+        return [] if task is None else [Outcome(task.step.name, member.name, lost=_ended(code), is_own_fault=own)]
 
 
 @dataclass(eq=False)
@@ -353,6 +404,7 @@ class _Member:
     setting: Mapping[str, str]
     task: Task | None = None
     is_ready: bool = False
+    compilation: Compilation = Compilation()
 
     @property
     def name(self) -> str:
@@ -387,17 +439,46 @@ def _serve(link: Any, setting: Mapping[str, str]) -> None:
         link.send(error)
         return
     link.send(None)
+    voice = _Voice(link)
     gc.freeze()  # what the server has imported is never garbage, and need not be looked at again and again
     gc.set_threshold(5_000)  # as in a command's own process
     later = [name for work in works.values() for name in work.later]
-    while True:
-        try:
-            task = tasks.get(timeout=IDLE if later else None)
-        except queue.Empty:
-            with suppress(ImportError):  # the step that needs it says so
-                import_module(later.pop())
-        else:
-            link.send(attempt(works, task))
+    with voice.compilation_told() if pickle.loads(content)[0].device else nullcontext():
+        while True:
+            try:
+                task = tasks.get(timeout=IDLE if later else None)
+            except queue.Empty:
+                with suppress(ImportError):  # the step that needs it says so
+                    import_module(later.pop())
+            else:
+                voice.say(attempt(works, task, voice.progress))
+
+
+class _Voice:
+    """What a process says to the driver, from whichever thread."""
+
+    def __init__(self, link: Any) -> None:
+        self._link, self._lock, self._latest = link, threading.Lock(), 0.0
+
+    def say(self, word: Outcome | StepProgress | Compilation) -> None:
+        """Say something; a driver that has ended hears nothing, and `_listen` notices."""
+        with self._lock, suppress(OSError):
+            self._link.send(word)
+
+    def progress(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Say how far a step is, now and then and at its end; a `NotedProgress`."""
+        if done >= total or time.monotonic() - self._latest >= SPEAKING:
+            self._latest = time.monotonic()
+            self.say(StepProgress(stage, done, total, note))
+
+    def compilation_told(self) -> AbstractContextManager[None]:
+        """Say what is compiled within."""
+        from beam_warp.device.compilation import compilation_heard
+
+        def told(module_count: int, seconds: float, *, is_running: bool) -> None:
+            self.say(Compilation(module_count, seconds, is_running))
+
+        return compilation_heard(told)
 
 
 def _listen(link: Any, tasks: queue.SimpleQueue[Any]) -> None:
@@ -448,10 +529,10 @@ def clear(works: Mapping[str, Work]) -> None:
         remove_leftovers(folder, *filter(Path.is_dir, folder.iterdir()))
 
 
-def attempt(works: Mapping[str, Work], task: Task) -> Outcome:
+def attempt(works: Mapping[str, Work], task: Task, progress: NotedProgress = no_progress) -> Outcome:
     """Do a task, and return what became of it in a form that can be sent."""
     try:
-        return Outcome(task.step.name, worker_name(), perform(works, task, no_progress))
+        return Outcome(task.step.name, worker_name(), perform(works, task, progress))
     except Exception as error:
         return Outcome(task.step.name, worker_name(), error=sendable(error))
 

@@ -14,7 +14,7 @@ from beam_warp.plan.workers import InProcess
 def started(monkeypatch):
     """What processes would be started with, on a machine with two GPUs."""
     found = []
-    monkeypatch.setattr(crew, "Processes", lambda works, terms, settings: found.extend(settings))
+    monkeypatch.setattr(crew, "Processes", lambda works, terms, settings, progress: found.extend(settings))
     monkeypatch.setattr(crew, "visible_gpus", lambda: ["3", "5"])
     return found
 

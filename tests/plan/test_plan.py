@@ -19,13 +19,14 @@ import pytest
 from support.storm_takes import processes_of
 from support.toy_work import toy_plan
 
+from beam_warp.device.compilation import compilation_heard
 from beam_warp.errors import InvalidOptionError, OutputError, UnfinishedError
 from beam_warp.plan.carry import Patience, carry_out
 from beam_warp.plan.page import left_in_words, write_page
 from beam_warp.plan.schedule import Schedule, State
 from beam_warp.plan.standing import look, simulated
 from beam_warp.plan.steps import Step, Task, is_whole, perform, read_receipt, wait_for
-from beam_warp.plan.workers import InProcess, Processes, Terms
+from beam_warp.plan.workers import InProcess, Processes, StepProgress, Terms
 
 
 def nobody(*step, **facts):
@@ -38,6 +39,19 @@ def here(plan, **options):
 
 def processes(plan, count=2):
     return Processes(plan.works, Terms.of(plan.folder, ""), [{}] * count)
+
+
+class SaidOnce:
+    """A link on which one thing is said."""
+
+    def __init__(self, said):
+        self.said = said
+
+    def recv(self):
+        return self.said
+
+    def close(self):
+        """Do nothing."""
 
 
 def outputs(folder):
@@ -323,6 +337,35 @@ class TestProcesses:
         plan = toy_plan(tmp_path, 1, faults={"frame-0": lambda: None})
         with pytest.raises(InvalidOptionError, match="work must be picklable"):
             processes(plan)
+
+    def test_what_a_process_says_of_its_steps_is_heard(self, tmp_path):
+        plan, heard = toy_plan(tmp_path), []
+        told = Processes(plan.works, Terms.of(tmp_path, ""), [{}], lambda *said, **words: heard.append(words))
+        carry_out(plan, told)
+        assert [words["note"] for words in heard] == calls(plan)
+        assert all((words["stage"], words["done"], words["total"]) == ("toy", 1, 1) for words in heard)
+
+    def test_one_process_speaks_of_a_stage_at_a_time(self, tmp_path):
+        """A bar that jumps from frame to frame says nothing."""
+        plan, heard = toy_plan(tmp_path), []
+        told = Processes(plan.works, Terms.of(tmp_path, ""), [{}] * 2, lambda *said, **words: heard.append(words))
+        for member in told._members:
+            told._hear(member)  # they are ready
+        first, second = told._members
+        for member, done in ((first, 1), (second, 2), (first, 3)):
+            member.link = SaidOnce(StepProgress("fit", done, 9, ""))
+            told._hear(member)
+        told._done(first)
+        second.link = SaidOnce(StepProgress("fit", 4, 9, ""))
+        told._hear(second)
+        told.close()
+        assert [words["done"] for words in heard] == [1, 3, 4]
+
+    def test_what_processes_compile_is_heard(self, tmp_path):
+        plan, heard = toy_plan(tmp_path, faults={"frame-0": "compile"}), []
+        with compilation_heard(lambda module_count, seconds, *, is_running: heard.append((module_count, seconds))):
+            carry_out(plan, Processes(plan.works, Terms.of(tmp_path, "cpu"), [{}]))
+        assert (2, 1.5) in heard
 
     @pytest.mark.parametrize(
         ("changed", "says"),

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from beam_warp.device.compilation import tell_of_compilation
 from beam_warp.errors import AssetFormatError
 from beam_warp.outputs import replacing
 from beam_warp.plan.steps import Plan, Step
@@ -33,6 +34,7 @@ class ToyWork:
 
     def do(self, task, progress):
         step = task.step
+        progress("toy", 1, 1, step.name)
         with (self.folder / "calls.txt").open("a") as calls:
             calls.write(f"{step.name}\n")
         self.fault(step)
@@ -53,6 +55,8 @@ class ToyWork:
         """Fail in the way that is asked for; with ``once``, at the first call only."""
         kind, _, when = self.faults.get(step.name, "").partition(" ")
         if kind and not (when == "once" and self.calls().count(step.name) > 1):
+            if kind == "compile":
+                tell_of_compilation(2, 1.5, is_running=False)
             if kind == "exit":
                 os._exit(3)
             if kind == "kill":
