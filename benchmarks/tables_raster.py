@@ -9,6 +9,7 @@ from raster_plot import draw_growth, draw_stages
 from tables import Row, Rows, cell, figure, number, table
 
 H200, CPU, NEWER = "raster_h200.json", "raster_cpu.json", "raster_gsplat16_h200.json"
+SHARED = "raster_checkpoints_h200.json"
 
 CASES = ("RGB and depth", "11 channels and depth")
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
@@ -79,7 +80,7 @@ def frames(result: Row, on_cpu: Row) -> Rows:
     return rows
 
 
-@table("raster_checkpoints", H200)
+@table("raster_checkpoints", SHARED)
 def checkpoints(result: Row) -> Rows:
     """Return the time of the way back, lists whole and shared out."""
     rows = [

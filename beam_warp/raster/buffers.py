@@ -18,6 +18,10 @@ from beam_warp.raster.layout import ChannelRanges, Rows, ViewLayout, channel_row
 from beam_warp.raster.records import RasterImages, RasterOptions
 from beam_warp.world.camera import Camera
 
+BLOCKS_HELD = 16
+"""Blocks of the way back that a multiprocessor can hold. Where there are more tiles than all of them hold, lists stay
+whole: no part of the GPU waits for the longest, and each part of a list costs a little."""
+
 
 class FrameBuffers:
     """Everything a frame is drawn from and into, on one device.
@@ -68,7 +72,8 @@ class FrameBuffers:
         self.channels = channels
         self.device = device
         self.exact = options.depth == "exact"
-        self._has_checkpoints = checkpoints and device.is_cuda
+        tile_count = int(self.layout.first_tiles[-1])
+        self._has_checkpoints = checkpoints and device.is_cuda and tile_count <= BLOCKS_HELD * device.sm_count
         if images_of is not None:
             self._require_room(images_of)
         with wp.ScopedDevice(device):

@@ -75,7 +75,7 @@ class Rasterizer:
                 `back_project` start from, lasts until the other draws.
             checkpoints: Whether `draw` notes on CUDA what pixels have come to on their way through long lists, so that
                 `backward` can share these out: faster where images are small, for 16 bytes more a pair and 4 for each
-                channel.
+                channel. Nothing is noted of images of more tiles than a GPU holds blocks.
 
         Raises:
             DeviceError: There is no such device.
