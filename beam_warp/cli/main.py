@@ -13,7 +13,7 @@ from beam_warp.cli.common.console import options_named, run_command
 from beam_warp.cli.common.pages import parse
 from beam_warp.cli.common.paths import paths_checked
 from beam_warp.errors import InvalidOptionError
-from beam_warp.plan.workers import serve
+from beam_warp.plan.processes import serve
 
 _HELP = """Relightable 4D Gaussian assets: reconstruct, decompose, relight, view, evaluate, demonstrate.
 

@@ -6,8 +6,9 @@ import os
 
 from beam_warp.errors import InvalidOptionError
 from beam_warp.jobs.listeners import NotedProgress
+from beam_warp.plan.processes import Processes
 from beam_warp.plan.steps import Plan
-from beam_warp.plan.workers import Crew, Processes, Terms, Workers, in_process
+from beam_warp.plan.workers import Crew, Terms, Workers, in_process
 
 MOST_PROCESSES = 256
 """Processes of one machine, at most."""

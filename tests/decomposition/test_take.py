@@ -18,8 +18,9 @@ from beam_warp.demo.from_images import FromImagesOptions, demo_steps
 from beam_warp.materials.evidence import view_evidence
 from beam_warp.materials.light_rays import MaterialOptions
 from beam_warp.plan.crew import crew_of
+from beam_warp.plan.processes import Processes
 from beam_warp.plan.standing import look
-from beam_warp.plan.workers import Processes, in_process
+from beam_warp.plan.workers import in_process
 from beam_warp.reconstruction.job import ReconstructionWork, ReconstructOptions
 from beam_warp.world.environment import EnvironmentMap
 

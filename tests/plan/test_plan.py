@@ -23,10 +23,11 @@ from beam_warp.device.compilation import compilation_heard
 from beam_warp.errors import InvalidOptionError, OutputError, UnfinishedError
 from beam_warp.plan.carry import Patience, carry_out
 from beam_warp.plan.page import left_in_words, write_page
+from beam_warp.plan.processes import Processes, StepProgress
 from beam_warp.plan.schedule import Schedule, State
 from beam_warp.plan.standing import look, simulated
 from beam_warp.plan.steps import Step, Task, is_whole, perform, read_receipt, wait_for
-from beam_warp.plan.workers import InProcess, Processes, StepProgress, Terms
+from beam_warp.plan.workers import InProcess, Terms
 
 
 def nobody(*step, **facts):
@@ -389,7 +390,8 @@ import sys
 from pathlib import Path
 from support.toy_work import toy_plan
 from beam_warp.plan.carry import carry_out
-from beam_warp.plan.workers import InProcess, Processes, Terms
+from beam_warp.plan.processes import Processes
+from beam_warp.plan.workers import InProcess, Terms
 
 if __name__ == "__main__":
     folder, count = Path(sys.argv[1]), int(sys.argv[2])

@@ -85,7 +85,7 @@ def test_channels_of_two_passes_are_selected_from_each(device, rng):
     ],
 )
 def test_what_needs_torch_says_what_to_install(monkeypatch, needs_torch):
-    for name in [n for n in sys.modules if n.partition(".")[0] == "torch" or n.startswith("beam_warp.interop.")]:
+    for name in [n for n in sys.modules if n.partition(".")[0] == "torch" or n.startswith("beam_warp.interop")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)  # as if it were not installed
     with pytest.raises(
