@@ -13,10 +13,11 @@ import os
 import pickle
 import queue
 import signal
+import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import connection, forkserver
@@ -101,6 +102,7 @@ class Processes:
         self._speakers: dict[str, _Member] = {}
         self._context = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
         self._packed = packed(works, terms)
+        self._can_hide_main = not any(type(work).__module__ == "__main__" for work in works.values())
         serve(_modules_of(works))
         self._members = [self._member(setting) for setting in settings]
 
@@ -151,7 +153,8 @@ class Processes:
         here, there = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(there, {**os.environ, **setting}), daemon=True)
         try:
-            process.start()
+            with _main_hidden() if self._can_hide_main else nullcontext():
+                process.start()
         except (EOFError, OSError):  # the server was killed
             if not pauses:
                 raise
@@ -227,6 +230,21 @@ class _Member:
     @property
     def name(self) -> str:
         return f"{worker_name().split(':')[0]}:{self.process.pid}"
+
+
+@contextmanager
+def _main_hidden() -> Iterator[None]:
+    """Let processes start without running the caller's script once more: nothing that they do is defined in it.
+
+    A script that calls for work where it is imported would call for it again in every process.
+    """
+    main = sys.modules["__main__"]
+    held = {name: vars(main)[name] for name in ("__file__", "__spec__") if name in vars(main)}
+    vars(main).update(dict.fromkeys(held))
+    try:
+        yield
+    finally:
+        vars(main).update(held)
 
 
 def _modules_of(works: Mapping[str, Work]) -> list[str]:

@@ -401,6 +401,33 @@ if __name__ == "__main__":
 """
 
 
+BARE = """
+import sys
+from pathlib import Path
+from support.toy_work import toy_plan
+from beam_warp.plan.carry import carry_out
+from beam_warp.plan.processes import Processes
+from beam_warp.plan.workers import Terms
+
+folder = Path(sys.argv[1])
+with (folder / "runs.txt").open("a") as runs:
+    runs.write("x")
+plan = toy_plan(folder, 3)
+carry_out(plan, Processes(plan.works, Terms.of(folder, ""), [{}] * 2))
+"""
+
+
+def test_a_script_is_not_run_again_by_its_processes(tmp_path):
+    """It has no guard, as scripts of users have none."""
+    script = tmp_path / "script.py"
+    script.write_text(BARE, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, script, tmp_path], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "runs.txt").read_text() == "x"
+    assert len(outputs(tmp_path)) == 8
+
+
 def begun(folder):
     """How often a step was begun."""
     return (folder / "calls.txt").read_text().count("\n") if (folder / "calls.txt").exists() else 0
