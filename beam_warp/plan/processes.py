@@ -102,7 +102,7 @@ class Processes:
         self._speakers: dict[str, _Member] = {}
         self._context = multiprocessing.get_context("forkserver" if CAN_FORK else "spawn")
         self._packed = packed(works, terms)
-        self._can_hide_main = not any(type(work).__module__ == "__main__" for work in works.values())
+        self._can_hide_main = b"__main__" not in self._packed  # a pickle names the module of all that it holds
         serve(_modules_of(works))
         self._members = [self._member(setting) for setting in settings]
 

@@ -409,22 +409,27 @@ from beam_warp.plan.carry import carry_out
 from beam_warp.plan.processes import Processes
 from beam_warp.plan.workers import Terms
 
+class Own(str):
+    pass
+
 folder = Path(sys.argv[1])
 with (folder / "runs.txt").open("a") as runs:
     runs.write("x")
-plan = toy_plan(folder, 3)
-carry_out(plan, Processes(plan.works, Terms.of(folder, ""), [{}] * 2))
+if __name__ == "__main__" or sys.argv[2] == "text":
+    plan = toy_plan(folder, 3, options=Own("o") if sys.argv[2] == "own" else "o")
+    carry_out(plan, Processes(plan.works, Terms.of(folder, ""), [{}] * 2))
 """
 
 
-def test_a_script_is_not_run_again_by_its_processes(tmp_path):
-    """It has no guard, as scripts of users have none."""
+@pytest.mark.parametrize(("held", "runs"), [("text", 1), ("own", 3)])
+def test_processes_run_a_script_again_only_for_what_is_defined_in_it(tmp_path, held, runs):
+    """The first has no guard, as scripts of users have none; works of the second hold a class of its own."""
     script = tmp_path / "script.py"
     script.write_text(BARE, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, script, tmp_path], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, script, tmp_path, held], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "runs.txt").read_text() == "x"
+    assert (tmp_path / "runs.txt").read_text() == runs * "x"
     assert len(outputs(tmp_path)) == 8
 
 
