@@ -19,8 +19,8 @@ from beam_warp.raster.records import RasterImages, RasterOptions
 from beam_warp.world.camera import Camera
 
 BLOCKS_HELD = 16
-"""Blocks of the way back that a multiprocessor can hold. Where there are more tiles than all of them hold, lists stay
-whole: no part of the GPU waits for the longest, and each part of a list costs a little."""
+"""Blocks of the way back that a multiprocessor holds at most. Where there are more tiles than all of them hold, lists
+stay whole: no part of the GPU waits for the longest, and each part of a list costs a little."""
 
 
 class FrameBuffers:

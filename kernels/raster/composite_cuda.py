@@ -2,7 +2,8 @@
 
 The block sorts its tile's list, as far as its pixels look, and brings `THREADS` splats at a time to shared memory. The
 lanes of a warp look at 32 of these at once: which reach the warp's pixels? The warp composites those, one after the
-other. The block is done when all its pixels are.
+other. The block is done when all its pixels are. Where checkpoints are asked for, it notes what its pixels have come to
+before each `STRIDE` splats but the first.
 """
 
 from functools import cache
