@@ -3,6 +3,7 @@
 Nothing here does anything sensible on the CPU, where a thread is alone; the kernels that call it are for CUDA.
 """
 
+import re
 from functools import cache
 
 import warp as wp
@@ -86,6 +87,40 @@ def lowest_lane(bits: int) -> int:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(bits);
+#else
+    return __builtin_popcount(bits);
+#endif
+""")
+def count_bits(bits: int) -> int:
+    """Number of lanes of a ballot that are not 0."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(bits & ((1u << (threadIdx.x & 31)) - 1u));
+#else
+    return 0;
+#endif
+""")
+def bits_below_lane(bits: int) -> int:
+    """Number of lanes before this one of a ballot that are not 0."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+""")
+def wait_for_warp():
+    """Return when all lanes of the warp are here, and see what they wrote."""
+    ...
+
+
 _SHARE_ROW = """
 #if defined(__CUDA_ARCH__)
     __shared__ float4 shared[KINDS * COUNT];
@@ -101,26 +136,33 @@ _SHARE_ROW = """
 #endif
 """
 
-_SHARE_CHANNELS = """
-    wp::vec_t<LENGTH, float> row;
+_SHARE_SPLATS = """
+    wp::vec_t<LENGTH, float> found;
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 shared[COUNT * (LENGTH / 4)];
+    __shared__ float4 shared[(KINDS + LENGTH / 4) * COUNT];
     float4* place = shared + index;
-    const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(splat) * (LENGTH / 4);
-    #pragma unroll
-    for (int i = 0; i < LENGTH / 4; ++i) {
-        if (store) {
-            place[COUNT * i] = __ldg(source + i);
-        } else {
-            const float4 part = place[COUNT * i];
-            row[4 * i] = part.x;
-            row[4 * i + 1] = part.y;
-            row[4 * i + 2] = part.z;
-            row[4 * i + 3] = part.w;
-        }
+    const auto get = [&](int i, const float4& part) {
+        found[4 * i] = part.x;
+        found[4 * i + 1] = part.y;
+        found[4 * i + 2] = part.z;
+        found[4 * i + 3] = part.w;
+    };
+    if (action == PUT_ROW) {
+        place[kind * COUNT] = make_float4(row[0], row[1], row[2], row[3]);
+    } else if (action == PUT_CHANNELS) {
+        const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(splat) * (LENGTH / 4);
+        #pragma unroll
+        for (int i = 0; i < LENGTH / 4; ++i)
+            place[(KINDS + i) * COUNT] = __ldg(source + i);
+    } else if (action == ROW) {
+        get(0, place[kind * COUNT]);
+    } else {
+        #pragma unroll
+        for (int i = 0; i < LENGTH / 4; ++i)
+            get(i, place[(KINDS + i) * COUNT]);
     }
 #endif
-    return row;
+    return found;
 """
 
 _HALVE = """
@@ -192,18 +234,31 @@ def share_row_function(kinds: int, count: int):
     return share_row
 
 
-@cache
-def share_channels_function(Channels, count: int):
-    """Return the function that copies a splat's channels to shared memory or, with ``store`` 0, takes them from there.
+PUT_ROW, PUT_CHANNELS, ROW, CHANNELS = (wp.constant(k) for k in range(4))
 
-    A block has ``count`` rows.
+
+@cache
+def share_splats_function(Channels, kinds: int, count: int):
+    """Return the function that keeps ``count`` splats in shared memory: some kinds of rows, and channels.
+
+    - `PUT_ROW` writes a row.
+    - `PUT_CHANNELS` copies a splat's channels.
+    - `ROW` returns a row as the first four of its numbers.
+    - `CHANNELS` returns channels.
+
+    All is one array, so that one register tells where a splat is.
     """
-    snippet = _SHARE_CHANNELS.replace("LENGTH", str(Channels._length_)).replace("COUNT", str(count))
+    length = Channels._length_
+    names = {"PUT_CHANNELS": PUT_CHANNELS, "PUT_ROW": PUT_ROW, "ROW": ROW}
+    numbers = {**names, "LENGTH": length, "KINDS": kinds, "COUNT": count}
+    snippet = re.sub("|".join(numbers), lambda name: str(int(numbers[name[0]])), _SHARE_SPLATS)
 
     @wp.func_native(snippet)
-    def share_channels(store: int, index: int, channels: wp.array[Channels], splat: int) -> Channels: ...
+    def share_splats(
+        action: int, kind: int, index: int, row: wp.vec4, channels: wp.array[Channels], splat: int
+    ) -> Channels: ...
 
-    return share_channels
+    return share_splats
 
 
 BEGIN_SUMS, ADD_TO_SUMS, END_SUMS = (wp.constant(k) for k in range(3))

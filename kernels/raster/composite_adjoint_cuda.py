@@ -16,13 +16,14 @@ import warp as wp
 from beam_warp.kernels.common.lanes import (
     ADD_TO_SUMS,
     BEGIN_SUMS,
+    CHANNELS,
     END_SUMS,
+    PUT_CHANNELS,
+    PUT_ROW,
     ballot,
     greatest_of_block,
     greatest_of_lanes,
     lowest_lane,
-    share_channels_function,
-    share_row_function,
     sum_block_function,
     wait_for_block,
 )
@@ -38,12 +39,19 @@ from beam_warp.kernels.raster.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, SHAPE, SLOPE, STRIDE, reaches
+from beam_warp.kernels.raster.composite_cuda import (
+    BEND,
+    CENTER,
+    LANES,
+    PART,
+    SHAPE,
+    SLOPE,
+    STRIDE,
+    reaches,
+    shared_splats_functions,
+)
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, sight_of
-
-PART = wp.constant(8)
-"""Side of the pixels of a warp."""
 
 WARPS = 4
 """Warps of a block: a tile is 16 x 16 pixels."""
@@ -113,21 +121,20 @@ def cut_function(channel_count: int):
 def share_splat_function(channel_count: int, exact: bool):
     """Return the function that brings a splat to shared memory, a part of it by each warp."""
     Channels = channel_vector(channel_count)
-    share_row = share_row_function(4 if exact else 3, LANES)
-    share_channels = share_channels_function(Channels, LANES)
+    share, _ = shared_splats_functions(channel_count, exact, LANES)
 
     @wp.func
     def share_splat(part: int, lane: int, frame: RasterFrame, channels: wp.array[Channels], splat: int):
         if part == 0:
-            share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
+            share(PUT_ROW, CENTER, lane, load_row(frame.splats.centers, splat), channels, 0)
         if part == 1:
-            share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
+            share(PUT_ROW, SHAPE, lane, load_row(frame.splats.shapes, splat), channels, 0)
         if part == 2:
-            share_row(1, SLOPE, lane, load_row(frame.splats.slopes, splat))
+            share(PUT_ROW, SLOPE, lane, load_row(frame.splats.slopes, splat), channels, 0)
         if part == 3:
-            share_channels(1, lane, channels, splat)
+            share(PUT_CHANNELS, 0, lane, wp.vec4(), channels, splat)
             if wp.static(exact):
-                share_row(1, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0))
+                share(PUT_ROW, BEND, lane, wp.vec4(frame.splats.bends[splat], 0.0, 0.0, 0.0), channels, 0)
 
     return share_splat
 
@@ -138,8 +145,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     add_pixel = add_pixel_function(channel_count, exact)
-    share_row = share_row_function(4 if exact else 3, LANES)
-    share_channels = share_channels_function(Channels, LANES)
+    share, shared_row = shared_splats_functions(channel_count, exact, LANES)
     share_splat = share_splat_function(channel_count, exact)
     cut = cut_function(channel_count)
     sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)
@@ -211,11 +217,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
             wanted = int(0)
             if splat >= 0 and mine < own_end:
                 wanted = reaches(
-                    share_row(0, CENTER, lane, wp.vec4()),
-                    share_row(0, SHAPE, lane, wp.vec4()),
-                    box.position,
-                    PART,
-                    PART,
+                    shared_row(CENTER, lane, channels), shared_row(SHAPE, lane, channels), box.position, PART, PART
                 )
             waiting = ballot(wanted)
             while waiting != 0:
@@ -223,18 +225,18 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                 waiting = waiting & (waiting - 1)
                 k = end - 1 - i
                 drawn = SplatRow()
-                drawn.center = share_row(0, CENTER, i, wp.vec4())
-                drawn.shape = share_row(0, SHAPE, i, wp.vec4())
+                drawn.center = shared_row(CENTER, i, channels)
+                drawn.shape = shared_row(SHAPE, i, channels)
                 above = sight_of(drawn.center, drawn.shape, upper.position)
                 below = sight_of(drawn.center, drawn.shape, lower.position)
                 in_upper = k < upper.end and above.log_alpha >= -LOG_CUT
                 in_lower = k < lower.end and below.log_alpha >= -LOG_CUT
                 if ballot(wp.where(in_upper or in_lower, 1, 0)) == 0:
                     continue
-                drawn.slope = share_row(0, SLOPE, i, wp.vec4())
+                drawn.slope = shared_row(SLOPE, i, channels)
                 if wp.static(exact):
-                    drawn.bend = share_row(0, BEND, i, wp.vec4())[0]
-                row = share_channels(0, i, channels, 0)
+                    drawn.bend = shared_row(BEND, i, channels)[0]
+                row = share(CHANNELS, 0, i, wp.vec4(), channels, 0)
                 total = Pair()
                 upper_alpha = wp.where(in_upper, alpha_of(above.log_alpha), 0.0)
                 lower_alpha = wp.where(in_lower, alpha_of(below.log_alpha), 0.0)

@@ -1,9 +1,10 @@
-"""Compositing on CUDA: a tile a block, 8 x 4 pixels a warp, a pixel a lane.
+"""Compositing on CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
 
-The block sorts its tile's list, as far as its pixels look, and brings `THREADS` splats at a time to shared memory. The
-lanes of a warp look at 32 of these at once: which reach the warp's pixels? The warp composites those, one after the
-other. The block is done when all its pixels are. Where checkpoints are asked for, it notes what its pixels have come to
-before each `STRIDE` splats but the first.
+The block sorts its tile's list, as far as its pixels look. Then each warp goes through what was sorted by itself: its
+lanes look at 32 splats at once, those that reach its pixels are brought to shared memory, and it composites them, one
+after the other. What a splat costs to read is shared by two pixels of a lane. The block is done when all its pixels
+are. Where checkpoints are asked for, a warp notes what its pixels have come to before each `STRIDE` splats but the
+first.
 """
 
 from functools import cache
@@ -12,17 +13,21 @@ import warp as wp
 
 from beam_warp.kernels.common.constants import TRANSMITTANCE_STOP
 from beam_warp.kernels.common.lanes import (
+    CHANNELS,
+    PUT_CHANNELS,
+    PUT_ROW,
+    ROW,
     any_of_block,
     ballot,
-    lowest_lane,
-    share_channels_function,
-    share_row_function,
-    wait_for_block,
+    bits_below_lane,
+    count_bits,
+    share_splats_function,
+    wait_for_warp,
 )
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
-from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Checkpoints, Images, RasterFrame, channel_vector, pixel_place
+from beam_warp.kernels.raster.bin_tiles import SIDE, TileLists
+from beam_warp.kernels.raster.composite import Checkpoints, Images, PixelPlace, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
     EXTENT_MARGIN,
@@ -40,14 +45,16 @@ from beam_warp.kernels.raster.splat_rows import (
 from beam_warp.kernels.raster.tile_lists_cuda import THREADS, sort_entries
 
 LANES = wp.constant(32)
-WIDTH = wp.constant(8)
-HEIGHT = wp.constant(4)
-"""Pixels of a warp."""
+PART = wp.constant(8)
+"""Side of the pixels of a warp."""
 
-STRIDE = THREADS
-"""Entries of a list between two checkpoints: those that are brought to shared memory at a time."""
+APART = wp.constant(PART // 2)
+"""Rows from a lane's upper pixel to its lower one."""
 
-BLOCKS = 4
+STRIDE = wp.constant(256)
+"""Entries of a list between two checkpoints, a multiple of a warp's lanes."""
+
+BLOCKS = 6
 """Blocks that a multiprocessor should hold at least: they limit registers."""
 
 NOWHERE = wp.constant(wp.vec4(0.0, 0.0, -1.0e30, 0.0))
@@ -83,16 +90,98 @@ def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, width: int, height:
     return wp.where(least <= squared_extent(center[2]), 1, 0)
 
 
+@wp.struct
+class PixelSums:
+    """What one of the pixels of a lane has come to, but for its channels; -1 stands for no place in the lists."""
+
+    depth: float
+    weight: float
+    transmittance: float
+    median_depth: float
+    median: int
+    last: int
+
+
+@wp.func
+def begin_pixel(place: PixelPlace) -> PixelSums:
+    """A pixel before its first splat; outside the image nothing is seen in it."""
+    sums = PixelSums()
+    sums.transmittance = wp.where(place.index < 0, 0.0, 1.0)
+    sums.median = -1
+    sums.last = -1
+    return sums
+
+
+@wp.func
+def looks(upper: PixelSums, lower: PixelSums) -> int:
+    """1 if one of two pixels still looks further."""
+    return wp.where(wp.max(upper.transmittance, lower.transmittance) >= TRANSMITTANCE_STOP, 1, 0)
+
+
+@wp.func
+def add_splat(sums: PixelSums, seen: bool, alpha: float, weight: float, z: float, at: int) -> PixelSums:
+    """A pixel after the splat at a place in the lists; no branch, see where it is called."""
+    sums.depth += z * weight
+    sums.weight += weight
+    sums.last = wp.where(seen, at, sums.last)
+    nearer = seen and sums.transmittance > MEDIAN
+    sums.median_depth = wp.where(nearer, z, sums.median_depth)
+    sums.median = wp.where(nearer, at, sums.median)
+    sums.transmittance *= 1.0 - alpha
+    return sums
+
+
+@wp.func
+def end_pixel(place: PixelPlace, sums: PixelSums, frame: RasterFrame, begin: int, out_images: Images):
+    """Write a pixel's images but for its channels; ``begin`` is where its tile's list begins."""
+    pixel = place.index
+    if pixel >= 0:
+        gaussian = int(-1)
+        end = begin
+        if sums.last >= 0:
+            gaussian = frame.lists.splats[sums.last] % frame.gaussian_count
+            end = sums.last + 1
+        out_images.alpha[pixel] = sums.weight
+        out_images.transmittance[pixel] = sums.transmittance
+        out_images.depth[pixel] = wp.where(sums.weight > 0.0, sums.depth / sums.weight, 0.0)
+        out_images.median_depth[pixel] = sums.median_depth
+        out_images.gaussians[pixel] = gaussian
+        out_images.ends[pixel] = end
+        out_images.medians[pixel] = sums.median
+
+
+@wp.func
+def listed_splat(lists: TileLists, place: int, end: int) -> int:
+    """The splat at a place in the lists; -1 from ``end`` on."""
+    splat = int(-1)
+    if place < end:
+        splat = lists.splats[place]
+    return splat
+
+
+@cache
+def shared_splats_functions(channel_count: int, exact: bool, count: int):
+    """Return the function that keeps ``count`` splats in shared memory, and the one that takes a row from there."""
+    Channels = channel_vector(channel_count)
+    share = share_splats_function(Channels, 4 if exact else 3, count)
+
+    @wp.func
+    def shared_row(kind: int, index: int, channels: wp.array[Channels]) -> wp.vec4:
+        row = share(ROW, kind, index, wp.vec4(), channels, 0)
+        return wp.vec4(row[0], row[1], row[2], row[3])
+
+    return share, shared_row
+
+
 @cache
 def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True):
-    """Return the kernel that composites ``channel_count`` channels, an item a pixel; unless ``colored``, none of them.
+    """Return the kernel that composites ``channel_count`` channels, two pixels an item; unless ``colored``, none.
 
     Shadow maps show depth alone. Channels then stay what they were: 0.
     """
     Channels = channel_vector(channel_count)
     depth_at = limited_depth_function(exact)
-    share_row = share_row_function(4 if exact else 3, THREADS)
-    share_channels = share_channels_function(Channels, THREADS)
+    share, shared_row = shared_splats_functions(channel_count, exact, THREADS)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=(THREADS, BLOCKS), grid_stride=False)
     def composite_blocks_kernel(
@@ -105,122 +194,120 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
         out_passed: wp.array[Channels],
     ):
         item = first + wp.tid()
-        thread = item % THREADS
-        lane = thread % LANES
+        lane = item % LANES
+        part = item % THREADS / LANES
         listed = frame.lists.order[item / THREADS]
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        part = thread / LANES
-        corner = part / (SIDE / WIDTH) * HEIGHT * SIDE + part % (SIDE / WIDTH) * WIDTH
+        corner = part / 2 * PART * SIDE + part % 2 * PART
         box = pixel_place(view, tile, corner).position
-        within = corner + lane / WIDTH * SIDE + lane % WIDTH
-        place = pixel_place(view, tile, within)
-        pixel = place.index
-        total = Channels()
-        depth = float(0.0)
-        weight_sum = float(0.0)
-        transmittance = float(1.0)
-        if pixel < 0:
-            transmittance = 0.0
-        median_depth = float(0.0)
-        median = int(-1)
+        within = corner + lane / PART * SIDE + lane % PART
+        upper_place = pixel_place(view, tile, within)
+        lower_place = pixel_place(view, tile, within + APART * SIDE)
+        upper = begin_pixel(upper_place)
+        lower = begin_pixel(lower_place)
+        upper_total = Channels()
+        lower_total = Channels()
         listed_range = frame.lists.ranges[listed]
-        last = int(-1)
         begin = listed_range[0]
-        sorted_end = listed_range[0]
         while begin < listed_range[1]:
-            if begin == sorted_end:
-                sorted_end = sort_entries(
-                    frame.lists.entries,
-                    frame.lists.owners,
-                    listed_range[0],
-                    begin,
-                    listed_range[1],
-                    frame.lists.parted,
-                    frame.lists.splats,
-                    frame.lists.slots,
-                )
-            count = wp.min(sorted_end - begin, THREADS)
-            if out_checkpoints.tiles.shape[0] > 0:
-                strayed = (begin - listed_range[0]) % STRIDE
-                if strayed != 0:  # by the end of what was sorted: the next stride begins as it should
-                    count = wp.min(count, STRIDE - strayed)
-                elif begin > listed_range[0]:
+            sorted_end = sort_entries(
+                frame.lists.entries,
+                frame.lists.owners,
+                listed_range[0],
+                begin,
+                listed_range[1],
+                frame.lists.parted,
+                frame.lists.splats,
+                frame.lists.slots,
+            )
+            # Groups begin at multiples of lanes, so that strides do, too, wherever what was sorted ended.
+            end = wp.min(begin + LANES - (begin - listed_range[0]) % LANES, sorted_end)
+            splat = listed_splat(frame.lists, begin + lane, end)
+            while begin < sorted_end:
+                if ballot(looks(upper, lower)) == 0:
+                    begin = sorted_end
+                    continue
+                passed_by = begin - listed_range[0]
+                if out_checkpoints.tiles.shape[0] > 0 and passed_by > 0 and passed_by % STRIDE == 0:
                     row = begin / STRIDE * SIDE * SIDE + within
                     out_checkpoints.tiles[begin / STRIDE] = listed + 1
-                    out_checkpoints.states[row] = wp.vec4(transmittance, weight_sum, depth, 0.0)
-                    out_passed[row] = total
-            splat = int(-1)
-            center = NOWHERE
-            if thread < count:
-                splat = frame.lists.splats[begin + thread]
-            if splat >= 0:
-                center = load_row(frame.splats.centers, splat)
-                shape = load_row(frame.splats.shapes, splat)
-                limits = depth_limits(center, shape, frame.near)
-                slope = load_row(frame.splats.slopes, splat)
-                if wp.static(exact):
-                    share_row(1, BEND, thread, wp.vec4(frame.splats.bends[splat], 0.0, limits[0], limits[1]))
-                else:
-                    slope = wp.vec4(slope[0], slope[1], limits[0], limits[1])
-                share_row(1, SHAPE, thread, shape)
-                share_row(1, SLOPE, thread, slope)
-                if wp.static(colored):
-                    share_channels(1, thread, channels, splat)
-            share_row(1, CENTER, thread, center)
-            wait_for_block()
-            group = int(0)
-            while group < count:
-                waiting = int(0)
-                if ballot(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) != 0:
-                    found = share_row(0, CENTER, group + lane, wp.vec4())
-                    waiting = ballot(reaches(found, share_row(0, SHAPE, group + lane, wp.vec4()), box, WIDTH, HEIGHT))
-                while waiting != 0:
-                    i = group + lowest_lane(waiting)
-                    waiting = waiting & (waiting - 1)
-                    drawn = share_row(0, CENTER, i, wp.vec4())
-                    drawn_shape = share_row(0, SHAPE, i, wp.vec4())
-                    offset = offset_from(drawn, place.position)
-                    log_alpha = log_alpha_of(drawn, whiten(drawn_shape, offset))
-                    seen = transmittance >= TRANSMITTANCE_STOP and log_alpha >= -LOG_CUT
-                    if ballot(wp.where(seen, 1, 0)) == 0:
+                    out_checkpoints.states[row] = wp.vec4(upper.transmittance, upper.weight, upper.depth, 0.0)
+                    out_passed[row] = upper_total
+                    row += APART * SIDE
+                    out_checkpoints.states[row] = wp.vec4(lower.transmittance, lower.weight, lower.depth, 0.0)
+                    out_passed[row] = lower_total
+                center = NOWHERE
+                shape = wp.vec4()
+                if splat >= 0:
+                    center = load_row(frame.splats.centers, splat)
+                    shape = load_row(frame.splats.shapes, splat)
+                wanted = reaches(center, shape, box, PART, PART)
+                waiting = ballot(wanted)
+                wait_for_warp()  # until all its lanes are done with the group before
+                i = part * LANES
+                if wanted != 0:
+                    mine = i + bits_below_lane(waiting)
+                    limits = depth_limits(center, shape, frame.near)
+                    slope = load_row(frame.splats.slopes, splat)
+                    if wp.static(exact):
+                        bend = wp.vec4(frame.splats.bends[splat], 0.0, limits[0], limits[1])
+                        share(PUT_ROW, BEND, mine, bend, channels, 0)
+                    else:
+                        slope = wp.vec4(slope[0], slope[1], limits[0], limits[1])
+                    # The limits hold what the thickness was for; its place is the splat's in the lists.
+                    shape = wp.vec4(shape[0], shape[1], shape[2], wp.cast(begin + lane, float))
+                    share(PUT_ROW, CENTER, mine, center, channels, 0)
+                    share(PUT_ROW, SHAPE, mine, shape, channels, 0)
+                    share(PUT_ROW, SLOPE, mine, slope, channels, 0)
+                    if wp.static(colored):
+                        share(PUT_CHANNELS, 0, mine, wp.vec4(), channels, splat)
+                begin = end
+                end = wp.min(begin + LANES, sorted_end)
+                splat = listed_splat(frame.lists, begin + lane, end)  # its way from memory takes as long as drawing
+                wait_for_warp()
+                stop = i + count_bits(waiting)
+                while i < stop:
+                    k = i
+                    i += 1
+                    drawn = shared_row(CENTER, k, channels)
+                    drawn_shape = shared_row(SHAPE, k, channels)
+                    above = offset_from(drawn, upper_place.position)
+                    below = offset_from(drawn, lower_place.position)
+                    log_above = log_alpha_of(drawn, whiten(drawn_shape, above))
+                    log_below = log_alpha_of(drawn, whiten(drawn_shape, below))
+                    in_upper = upper.transmittance >= TRANSMITTANCE_STOP and log_above >= -LOG_CUT
+                    in_lower = lower.transmittance >= TRANSMITTANCE_STOP and log_below >= -LOG_CUT
+                    if ballot(wp.where(in_upper or in_lower, 1, 0)) == 0:
                         continue
                     # No branches from here on: each would cost a selection for every variable that it changes.
-                    alpha = wp.where(seen, alpha_of(log_alpha), 0.0)
-                    weight = alpha * transmittance
-                    slope = share_row(0, SLOPE, i, wp.vec4())
+                    at = wp.cast(drawn_shape[3], int)
+                    slope = shared_row(SLOPE, k, channels)
                     bounds = slope
                     if wp.static(exact):
-                        bounds = share_row(0, BEND, i, wp.vec4())
-                    z = depth_at(drawn[3], wp.vec2(bounds[2], bounds[3]), slope, bounds[0], offset)
+                        bounds = shared_row(BEND, k, channels)
+                    limits = wp.vec2(bounds[2], bounds[3])
+                    upper_z = depth_at(drawn[3], limits, slope, bounds[0], above)
+                    lower_z = depth_at(drawn[3], limits, slope, bounds[0], below)
+                    upper_alpha = wp.where(in_upper, alpha_of(log_above), 0.0)
+                    lower_alpha = wp.where(in_lower, alpha_of(log_below), 0.0)
+                    upper_weight = upper_alpha * upper.transmittance
+                    lower_weight = lower_alpha * lower.transmittance
                     if wp.static(colored):
-                        total += share_channels(0, i, channels, 0) * weight
-                    depth += z * weight
-                    weight_sum += weight
-                    last = wp.where(seen, begin + i, last)
-                    nearer = seen and transmittance > MEDIAN
-                    median_depth = wp.where(nearer, z, median_depth)
-                    median = wp.where(nearer, begin + i, median)
-                    transmittance *= 1.0 - alpha
-                group += LANES
-            begin += count
-            if any_of_block(wp.where(transmittance >= TRANSMITTANCE_STOP, 1, 0)) == 0:
+                        row_of = share(CHANNELS, 0, k, wp.vec4(), channels, 0)
+                        upper_total += row_of * upper_weight
+                        lower_total += row_of * lower_weight
+                    upper = add_splat(upper, in_upper, upper_alpha, upper_weight, upper_z, at)
+                    lower = add_splat(lower, in_lower, lower_alpha, lower_weight, lower_z, at)
+            if any_of_block(looks(upper, lower)) == 0:
                 begin = listed_range[1]
-        if pixel >= 0:
-            gaussian = int(-1)
-            end = listed_range[0]
-            if last >= 0:
-                gaussian = frame.lists.splats[last] % frame.gaussian_count
-                end = last + 1
-            if wp.static(colored):
-                out_channels[pixel] = total
-            out_images.alpha[pixel] = weight_sum
-            out_images.transmittance[pixel] = transmittance
-            out_images.depth[pixel] = wp.where(weight_sum > 0.0, depth / weight_sum, 0.0)
-            out_images.median_depth[pixel] = median_depth
-            out_images.gaussians[pixel] = gaussian
-            out_images.ends[pixel] = end
-            out_images.medians[pixel] = median
+        end_pixel(upper_place, upper, frame, listed_range[0], out_images)
+        end_pixel(lower_place, lower, frame, listed_range[0], out_images)
+        if wp.static(colored):
+            if upper_place.index >= 0:
+                out_channels[upper_place.index] = upper_total
+            if lower_place.index >= 0:
+                out_channels[lower_place.index] = lower_total
 
     return composite_blocks_kernel
 
@@ -231,7 +318,7 @@ def launch_composite_cuda(
     """Composite a band on a CUDA device; checkpoints get their sums of channels in ``out_passed``."""
     launch(
         composite_cuda_kernel(channels.dtype._length_, exact, colored),
-        (frame.band.end_tile - frame.band.first_tile) * SIDE * SIDE,
+        (frame.band.end_tile - frame.band.first_tile) * THREADS,
         inputs=[frame, channels],
         outputs=[out_channels, out_images, out_checkpoints, out_passed],
         device=device,

@@ -7,6 +7,8 @@ many more as its pixels look at: where the front hides the rest, most of a long 
 Entries are emitted by atomics, in any order; once they are sorted nothing of it is left.
 """
 
+import re
+
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
@@ -14,7 +16,10 @@ from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import Band, SplatOrder, TileLists, tile_box, tile_columns
 from beam_warp.kernels.raster.project import CameraMove, Projection, RasterView, Splats, project_still
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+# Pairs are counted by one kernel and emitted by another, which must find the same tiles to the last bit: a pair that is
+# counted and not emitted leaves what an earlier frame wrote. So each operation is rounded by itself: which products and
+# sums a compiler fuses depends on the code around them.
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fuse_fp": False})
 
 SORTED = 1024
 """Most entries that a block sorts at a time."""
@@ -25,11 +30,16 @@ SPREAD = wp.constant(8)
 EMITTED = wp.constant(4)
 """Place in a tally of the number of pairs that were emitted."""
 
+AHEAD = 4
+"""Tiles of a row whose pairs are emitted together."""
+
+Places = wp.types.vector(length=AHEAD, dtype=int)
+
 FEW = 128
 """Most entries of a list that are compared with each other, at most `THREADS`."""
 
-THREADS = wp.constant(256)
-"""Threads of the blocks that sort; each counts four bins of depth."""
+THREADS = wp.constant(128)
+"""Threads of the blocks that sort, a power of two; each counts four bins of depth."""
 
 PLANNERS = 1024
 """Threads of the block that plans."""
@@ -90,6 +100,36 @@ def project_entries_kernel(
     out_counts[splat] = count_entries(splat, out_splats, view, band, out_tallies)
 
 
+@wp.func_native(
+    """
+    wp::vec_t<AHEAD, int> places;
+#if defined(__CUDA_ARCH__)
+    #pragma unroll
+    for (int k = 0; k < AHEAD; ++k)
+        places[k] = k < count ? atomicAdd(tallies.data + (tile + k) * SPREAD + EMITTED, 1) : 0;
+#endif
+    return places;
+""".replace("AHEAD", str(AHEAD))
+    .replace("SPREAD", str(int(SPREAD)))
+    .replace("EMITTED", str(int(EMITTED)))
+)
+def take_places(tallies: wp.array[int], tile: int, count: int) -> Places:
+    """Places of an entry in the lists of ``count`` tiles side by side, at most `AHEAD`."""
+    ...
+
+
+@wp.func
+def write_entry(lists: TileLists, tile: int, place: int, depth: wp.uint64, splat: int, slot: int, end: int):
+    """Write the pair of a tile and a splat, and who owns its slot; ``end`` is that of the splat's slots."""
+    room = lists.ranges[tile]
+    at = room[0] + place
+    has_slot = slot >= 0 and slot < end
+    if has_slot:
+        lists.owners[slot] = splat
+    if at < room[1]:
+        lists.entries[at] = wp.where(has_slot, depth | wp.uint64(slot), NO_SLOT | wp.uint64(at))
+
+
 @wp.kernel
 def emit_entries_kernel(
     first: int,
@@ -113,18 +153,26 @@ def emit_entries_kernel(
     view = views[splat / gaussian_count]
     box = tile_box(center, shape, view, band)
     depth = wp.uint64(wp.cast(center[3], int)) << wp.uint64(32)  # bits of a positive float sort like an integer
-    for row in range(box[1], box[3]):
-        columns = tile_columns(center, shape, view, box, row)
-        for column in range(columns[0], columns[1]):
-            tile = view.first_tile - band.first_tile + row * view.columns + column
-            room = out_lists.ranges[tile]
-            place = room[0] + wp.atomic_add(tallies, tile * SPREAD + EMITTED, 1)
-            has_slot = slot >= 0 and slot < end
-            if has_slot:
-                out_lists.owners[slot] = splat
-            if place < room[1]:
-                out_lists.entries[place] = wp.where(has_slot, depth | wp.uint64(slot), NO_SLOT | wp.uint64(place))
-            slot += 1
+    # Two rows at a time, some columns of each: a thread does not wait for one atomic after the other.
+    for row in range(box[1], box[3], 2):
+        tile = view.first_tile - band.first_tile + row * view.columns
+        upper = tile_columns(center, shape, view, box, row)
+        lower = wp.vec2i(0, 0)
+        if row + 1 < box[3]:
+            lower = tile_columns(center, shape, view, box, row + 1)
+        counts = wp.vec2i(upper[1] - upper[0], lower[1] - lower[0])
+        upper_tile = tile + upper[0]
+        lower_tile = tile + view.columns + lower[0]
+        for column in range(0, wp.max(counts[0], counts[1]), AHEAD):
+            upper_places = take_places(tallies, upper_tile + column, counts[0] - column)
+            lower_places = take_places(tallies, lower_tile + column, counts[1] - column)
+            for k in range(AHEAD):
+                at = column + k
+                if at < counts[0]:
+                    write_entry(out_lists, upper_tile + at, upper_places[k], depth, splat, slot + at, end)
+                if at < counts[1]:
+                    write_entry(out_lists, lower_tile + at, lower_places[k], depth, splat, slot + counts[0] + at, end)
+        slot += counts[0] + counts[1]
 
 
 @wp.func_native(
@@ -299,7 +347,7 @@ _SORT_ENTRIES = """
         Entry* to = reinterpret_cast<Entry*>(parted.data);
         if (listed == begin) {
             find_range(0);
-            shift = max(0, 64 - __clzll(high - low) - 8);
+            shift = max(0, 64 - __clzll(high - low) - BITS);
             parts[thread] = 0;
             __syncthreads();
             visit([&](Entry entry) { atomicAdd(parts + (int)((entry - low) >> shift), 1); });
@@ -322,7 +370,7 @@ _SORT_ENTRIES = """
     find_range(start);
     // Narrow the range until its first bins hold few enough; no two entries are equal.
     for (bool few = false; !few;) {
-        shift = max(0, 64 - __clzll(high - low) - 10);
+        shift = max(0, 64 - __clzll(high - low) - BITS - 2);
         int* four = bins + 4 * thread;
         for (int k = 0; k < 4; ++k)
             four[k] = 0;
@@ -373,7 +421,10 @@ _SORT_ENTRIES = """
 """
 
 
-@wp.func_native(_SORT_ENTRIES.replace("SORTED", str(SORTED)).replace("FEW", str(FEW)).replace("THREADS", str(THREADS)))
+_NUMBERS = {"SORTED": SORTED, "FEW": FEW, "THREADS": int(THREADS), "BITS": int(THREADS).bit_length() - 1}
+
+
+@wp.func_native(re.sub("|".join(_NUMBERS), lambda name: str(_NUMBERS[name[0]]), _SORT_ENTRIES))
 def sort_entries(
     entries: wp.array[wp.uint64],
     owners: wp.array[int],

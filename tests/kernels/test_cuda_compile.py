@@ -114,5 +114,21 @@ def test_compiles_for_sm_90(compiled, name):
     assert count >= (2 if name in TRACING else 1)
 
 
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
+def test_kernels_that_must_agree_round_every_operation(tmp_path):
+    """Of what counts pairs and what emits them no product is fused with a sum: which one is depends on the kernel."""
+    import warp as wp
+
+    from beam_warp.kernels.raster import tile_lists_cuda
+
+    module = tile_lists_cuda.emit_entries_kernel.module
+    (path,) = wp.compile_aot_module(module, arch=90, use_ptx=True, module_dir=tmp_path)
+    entries = Path(path).read_text(encoding="utf-8", errors="ignore").split(".entry ")
+    for name in ("count_entries_kernel", "emit_entries_kernel"):
+        (own,) = (entry for entry in entries if entry.startswith(name))
+        assert "mul.rn.f32" in own
+        assert not any(fused in own for fused in ("fma.rn.f32", "mul.f32", "add.f32"))
+
+
 if __name__ == "__main__":
     Path(sys.argv[2]).write_text(json.dumps(compile_all(sys.argv[1], int(sys.argv[3]))))

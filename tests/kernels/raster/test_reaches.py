@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from beam_warp.kernels.raster.composite_cuda import HEIGHT, WIDTH, reaches
+from beam_warp.kernels.raster.composite_cuda import PART, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import log_alpha_of, offset_from, whiten
 
@@ -17,11 +17,11 @@ def look_at_boxes_kernel(
     """How many pixels of a box a splat counts for, and whether it reaches the box."""
     i = wp.tid()
     counted = wp.int32(0)
-    for k in range(WIDTH * HEIGHT):
-        pixel = firsts[i] + wp.vec2(float(k % WIDTH), float(k / WIDTH))
+    for k in range(PART * PART):
+        pixel = firsts[i] + wp.vec2(float(k % PART), float(k / PART))
         if log_alpha_of(centers[i], whiten(shapes[i], offset_from(centers[i], pixel))) >= -LOG_CUT:
             counted += 1
-    out_found[i] = wp.vec2i(counted, reaches(centers[i], shapes[i], firsts[i], WIDTH, HEIGHT))
+    out_found[i] = wp.vec2i(counted, reaches(centers[i], shapes[i], firsts[i], PART, PART))
 
 
 def test_no_pixel_that_counts_is_passed_over(rng):
@@ -37,7 +37,7 @@ def test_no_pixel_that_counts_is_passed_over(rng):
         [rim[0] * np.cos(angle) - rim[1] * np.sin(angle), rim[0] * np.sin(angle) + rim[1] * np.cos(angle)]
     )
     firsts = np.floor(rng.uniform(0.0, 1000.0, (COUNT, 2))) + 0.5
-    places = firsts - sideways.T + rng.uniform(0.0, (WIDTH - 1.0, HEIGHT - 1.0), (COUNT, 2))
+    places = firsts - sideways.T + rng.uniform(0.0, PART - 1.0, (COUNT, 2))
     centers = np.c_[places, np.log(rng.uniform(1.01 / 255.0, 1.0, COUNT)), np.ones(COUNT)]
     given = ((centers, wp.vec4), (shapes, wp.vec4), (firsts, wp.vec2))
     arrays = [wp.array(rows.astype(np.float32), dtype=dtype, device="cpu") for rows, dtype in given]
@@ -46,7 +46,7 @@ def test_no_pixel_that_counts_is_passed_over(rng):
     counted, reached = out.numpy().T
     assert (counted > 0).mean() > 0.5
     assert not ((counted > 0) & (reached == 0)).any()
-    far = np.abs(places - firsts).max(axis=1) > 3.4 * np.sqrt(np.maximum(xx, yy)) + WIDTH + 1.0
+    far = np.abs(places - firsts).max(axis=1) > 3.4 * np.sqrt(np.maximum(xx, yy)) + PART + 1.0
     assert not reached[far].any()
 
 

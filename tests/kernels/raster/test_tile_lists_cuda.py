@@ -4,8 +4,21 @@ import numpy as np
 import pytest
 import warp as wp
 
-from beam_warp.kernels.raster.bin_tiles import TileLists
-from beam_warp.kernels.raster.tile_lists_cuda import SORTED, SPREAD, THREADS, launch_plan_tiles, sort_entries
+from beam_warp.kernels.raster.bin_tiles import SIDE, Band, SplatOrder, TileLists
+from beam_warp.kernels.raster.project import LOG_CUT, RasterView, Splats
+from beam_warp.kernels.raster.splat_rows import EXTENT_MARGIN, RELATIVE_MARGIN
+from beam_warp.kernels.raster.tile_lists_cuda import (
+    EMITTED,
+    SORTED,
+    SPREAD,
+    THREADS,
+    launch_count_entries,
+    launch_emit_entries,
+    launch_plan_tiles,
+    sort_entries,
+)
+from beam_warp.raster.layout import ViewLayout
+from beam_warp.world.camera import Camera
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 
@@ -86,3 +99,55 @@ def test_tiles_have_their_room_and_their_turn(rng, tile_count, room):
     turns = lengths[order]
     assert (turns[1:] <= 1.26 * turns[:-1]).all()
     assert (np.maximum.accumulate(turns[::-1])[::-1] <= 1.26 * turns).all()
+
+
+def test_every_pair_that_is_counted_is_emitted(rng):
+    """Ellipses whose left end in a row of tiles is where a column begins: the last bit says which columns they reach.
+
+    One kernel counts, another emits. A pair that only one of them finds leaves an entry of an earlier frame in a list,
+    so that images differ from run to run.
+    """
+    count, side = 1_000_000, 1024
+    long, thin = rng.uniform(6.0, 30.0, count), rng.uniform(0.6, 5.0, count)
+    angle = rng.uniform(0.0, np.pi, count)
+    along, across = np.cos(angle), np.sin(angle)
+    xx, yy = (long * along) ** 2 + (thin * across) ** 2, (long * across) ** 2 + (thin * along) ** 2
+    xy = (long**2 - thin**2) * along * across
+    shapes = np.stack([1 / np.sqrt(xx), xy / xx, np.sqrt(xx / (xx * yy - xy * xy)), long], axis=1).astype(np.float32)
+    opacities = np.log(rng.uniform(0.1, 1.0, count)).astype(np.float32)
+    y = rng.uniform(300.0, 700.0, count).astype(np.float32)
+    top = np.floor(y / SIDE + rng.integers(-1, 2, count)) * SIDE + 0.5 - y.astype(np.float64)
+    left = _left_end(shapes.astype(np.float64), 2.0 * (float(LOG_CUT) + opacities), top, top + SIDE - 1.0)
+    x = rng.integers(20, 44, count) * float(SIDE) - 0.5 - left
+    centers = np.stack([x, y, opacities, np.ones(count)], axis=1)
+    splats, order, lists, band = Splats(), SplatOrder(), TileLists(), Band()
+    layout = ViewLayout.of([Camera.orbit((0, 0, 0), 2.0, 0, 0, width=side, height=side, vertical_fov=40)])
+    tile_count = len(layout.tile_views)
+    zeros = lambda size, dtype=int: wp.zeros(size, dtype=dtype, device="cuda:0")  # noqa: E731
+    splats.centers, splats.shapes = (wp.array(rows, dtype=wp.vec4, device="cuda:0") for rows in (centers, shapes))
+    views = wp.array(layout.views, dtype=RasterView, device="cuda:0")
+    band.first_tile, band.end_tile = 0, tile_count
+    order.counts, order.ends, tallies = zeros(count), zeros(count), zeros(tile_count * int(SPREAD))
+    launch_count_entries(count, splats, views, count, band, order.counts, tallies, "cuda:0")
+    wp.utils.array_scan(order.counts, order.ends, inclusive=True)
+    pairs = int(order.ends.numpy()[-1])
+    lists.ranges, lists.order = zeros(tile_count, wp.vec2i), zeros(tile_count)
+    lists.owners, lists.entries = zeros(pairs), zeros(pairs, wp.uint64)
+    launch_plan_tiles(tallies, tile_count, pairs, lists, "cuda:0")
+    launch_emit_entries(order, splats, views, count, band, tallies, lists, "cuda:0")
+    counted, emitted = tallies.numpy().reshape(tile_count, -1)[:, [0, int(EMITTED)]].T
+    assert pairs > 2 * count
+    np.testing.assert_array_equal(emitted, counted)
+    assert (lists.entries.numpy() != 0).all()
+    np.testing.assert_array_equal(lists.owners.numpy(), np.repeat(np.arange(count), order.counts.numpy()))
+
+
+def _left_end(shapes, squared, top, bottom):
+    """Least x of ellipses between two y, with the margins that belong to it; both from the centres."""
+    s0, s1, s2, _ = shapes.T
+    e = s1 * s2
+    k = s0 * s0 + e * e
+    y = np.clip(-np.sqrt(squared) * s1 / s0, top, bottom)
+    half = np.sqrt(np.maximum(k * squared - (s0 * s2 * y) ** 2, 0.0))
+    left, right = (e * s2 * y - half) / k, (e * s2 * y + half) / k
+    return left - float(RELATIVE_MARGIN) * np.maximum(np.abs(left), np.abs(right)) - float(EXTENT_MARGIN)
