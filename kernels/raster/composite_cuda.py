@@ -159,6 +159,15 @@ def listed_splat(lists: TileLists, place: int, end: int) -> int:
     return splat
 
 
+@wp.func
+def splat_row(rows: wp.array[wp.vec4], splat: int, otherwise: wp.vec4) -> wp.vec4:
+    """The row of a splat, or another one where there is none."""
+    row = otherwise
+    if splat >= 0:
+        row = load_row(rows, splat)
+    return row
+
+
 @cache
 def shared_splats_functions(channel_count: int, exact: bool, count: int):
     """Return the function that keeps ``count`` splats in shared memory, and the one that takes a row from there."""
@@ -224,6 +233,9 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
             # Groups begin at multiples of lanes, so that strides do, too, wherever what was sorted ended.
             end = wp.min(begin + LANES - (begin - listed_range[0]) % LANES, sorted_end)
             splat = listed_splat(frame.lists, begin + lane, end)
+            center = splat_row(frame.splats.centers, splat, NOWHERE)
+            shape = splat_row(frame.splats.shapes, splat, NOWHERE)
+            ahead = listed_splat(frame.lists, end + lane, wp.min(end + LANES, sorted_end))
             while begin < sorted_end:
                 if ballot(looks(upper, lower)) == 0:
                     begin = sorted_end
@@ -237,11 +249,6 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     row += APART * SIDE
                     out_checkpoints.states[row] = wp.vec4(lower.transmittance, lower.weight, lower.depth, 0.0)
                     out_passed[row] = lower_total
-                center = NOWHERE
-                shape = wp.vec4()
-                if splat >= 0:
-                    center = load_row(frame.splats.centers, splat)
-                    shape = load_row(frame.splats.shapes, splat)
                 wanted = reaches(center, shape, box, PART, PART)
                 waiting = ballot(wanted)
                 wait_for_warp()  # until all its lanes are done with the group before
@@ -262,9 +269,13 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     share(PUT_ROW, SLOPE, mine, slope, channels, 0)
                     if wp.static(colored):
                         share(PUT_CHANNELS, 0, mine, wp.vec4(), channels, splat)
+                # What the next groups need is on its way from memory while this one is drawn.
                 begin = end
                 end = wp.min(begin + LANES, sorted_end)
-                splat = listed_splat(frame.lists, begin + lane, end)  # its way from memory takes as long as drawing
+                splat = ahead
+                center = splat_row(frame.splats.centers, splat, NOWHERE)
+                shape = splat_row(frame.splats.shapes, splat, NOWHERE)
+                ahead = listed_splat(frame.lists, end + lane, wp.min(end + LANES, sorted_end))
                 wait_for_warp()
                 stop = i + count_bits(waiting)
                 while i < stop:
