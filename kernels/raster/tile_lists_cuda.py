@@ -27,8 +27,8 @@ SORTED = 1024
 SPREAD = wp.constant(8)
 """Numbers of a tile's tally: atomics on one sector of 32 bytes wait for each other. The first is that of its pairs."""
 
-NEXT = wp.constant(4)
-"""Place in a tally of where the tile's next entry goes, beyond all lists where its own does not fit."""
+EMITTED = wp.constant(4)
+"""Place in a tally of the number of pairs that were emitted."""
 
 AHEAD = 4
 """Tiles of a row whose pairs are emitted together."""
@@ -106,26 +106,28 @@ def project_entries_kernel(
 #if defined(__CUDA_ARCH__)
     #pragma unroll
     for (int k = 0; k < AHEAD; ++k)
-        places[k] = k < count ? atomicAdd(tallies.data + (tile + k) * SPREAD + NEXT, 1) : 0;
+        places[k] = k < count ? atomicAdd(tallies.data + (tile + k) * SPREAD + EMITTED, 1) : 0;
 #endif
     return places;
 """.replace("AHEAD", str(AHEAD))
     .replace("SPREAD", str(int(SPREAD)))
-    .replace("NEXT", str(int(NEXT)))
+    .replace("EMITTED", str(int(EMITTED)))
 )
 def take_places(tallies: wp.array[int], tile: int, count: int) -> Places:
-    """Places of an entry in the lists of ``count`` tiles side by side, at most `AHEAD` of them."""
+    """Places of an entry in the lists of ``count`` tiles side by side, at most `AHEAD`."""
     ...
 
 
 @wp.func
-def write_entry(lists: TileLists, place: int, depth: wp.uint64, splat: int, slot: int, end: int):
-    """Write a splat's entry in a tile's list, and who owns its slot; ``end`` is that of the splat's slots."""
+def write_entry(lists: TileLists, tile: int, place: int, depth: wp.uint64, splat: int, slot: int, end: int):
+    """Write the pair of a tile and a splat, and who owns its slot; ``end`` is that of the splat's slots."""
+    room = lists.ranges[tile]
+    at = room[0] + place
     has_slot = slot >= 0 and slot < end
     if has_slot:
         lists.owners[slot] = splat
-    if place < lists.entries.shape[0]:
-        lists.entries[place] = wp.where(has_slot, depth | wp.uint64(slot), NO_SLOT | wp.uint64(place))
+    if at < room[1]:
+        lists.entries[at] = wp.where(has_slot, depth | wp.uint64(slot), NO_SLOT | wp.uint64(at))
 
 
 @wp.kernel
@@ -139,7 +141,7 @@ def emit_entries_kernel(
     tallies: wp.array[int],
     out_lists: TileLists,
 ):
-    """Entries of lists that do not fit are left out; a pair without a slot, beyond the capacity, leaves a last one."""
+    """Entries beyond a tile's room are left out; a pair without a slot, beyond the capacity, leaves a last entry."""
     splat = first + wp.tid()
     count = order.counts[splat]
     if count <= 0:
@@ -167,9 +169,9 @@ def emit_entries_kernel(
             for k in range(AHEAD):
                 at = column + k
                 if at < counts[0]:
-                    write_entry(out_lists, upper_places[k], depth, splat, slot + at, end)
+                    write_entry(out_lists, upper_tile + at, upper_places[k], depth, splat, slot + at, end)
                 if at < counts[1]:
-                    write_entry(out_lists, lower_places[k], depth, splat, slot + counts[0] + at, end)
+                    write_entry(out_lists, lower_tile + at, lower_places[k], depth, splat, slot + counts[0] + at, end)
         slot += counts[0] + counts[1]
 
 
@@ -224,9 +226,7 @@ def emit_entries_kernel(
         const Sum start = own_before & (((Sum)1 << 40) - 1);
         if (i < end) {
             const bool fits = start + length <= capacity;
-            const int begin = fits ? (int)start : capacity;
-            ranges.data[i] = wp::vec2i(begin, fits ? begin + length : capacity);
-            tallies.data[i * SPREAD + NEXT] = begin;
+            ranges.data[i] = wp::vec2i(fits ? (int)start : capacity, fits ? (int)start + length : capacity);
             const int empty = (int)(own_before >> 40);
             order.data[length > 0 ? atomicAdd(places + CLASS(length), 1) : tile_count - 1 - empty] = i;
         }
@@ -235,7 +235,7 @@ def emit_entries_kernel(
     #undef WEIGHT
     #undef CLASS
 #endif
-""".replace("SPREAD", str(int(SPREAD))).replace("NEXT", str(int(NEXT)))
+""".replace("SPREAD", str(SPREAD))
 )
 def plan_tiles(
     tallies: wp.array[int], tile_count: int, capacity: int, ranges: wp.array[wp.vec2i], order: wp.array[int]
@@ -243,7 +243,7 @@ def plan_tiles(
     """Places of the tiles' lists, one after the other, and the order in which tiles are drawn; by one block.
 
     What begins last should not take longest: long lists lie where a surface is seen edge on. Tiles whose lists do not
-    fit have none. Each tally is told where the tile's first entry goes.
+    fit have none.
     """
     ...
 
