@@ -40,6 +40,9 @@ Row = dict[str, Any]
 CASES = {"RGB and depth": 3, "11 channels and depth": 11}
 """Channels of the comparison with gsplat; 3 are the captured colour."""
 
+SIZES, MOST_TIMES = (1_000, 10_000, 140_000, 1_000_000, 5_000_000), 40
+"""Gaussians of frames that are timed by themselves, and how many times those of other frames they may be."""
+
 PARTS = ("forward", "backward", "training")
 """Timed parts of a training step: drawing, the way back, and both one after the other."""
 
@@ -339,6 +342,21 @@ def measure_variants(effort: Effort, device: Any) -> Row:
     return found
 
 
+def measure_sizes(effort: Effort, device: Any) -> Row:
+    """Time frames of RGB and depth over the number of Gaussians, forwards and backwards, each as one CUDA graph."""
+    rows: list[Row] = []
+    for count in (n for n in SIZES if n <= MOST_TIMES * effort.gaussians):
+        scene = figure(count, *effort.size)
+        say(f"sizes: {count:,} Gaussians")
+        drawing = Drawing(scene, device, values=scene.values()[:, :3])
+        works = {"forward": drawing.forward, "backward": drawing.backward}
+        tasks = {name: Clocked.on(device, captured(work, device)) for name, work in works.items()}
+        measured = measure_in_turn(tasks, effort.repeats, device)
+        times = {name: entry.summary() for name, entry in measured.items()}
+        rows.append({"scene": describe(scene), "pairs": drawing.rasterizer.pair_count(), **times})
+    return {"repeats": effort.repeats, "rows": rows}
+
+
 def measure_checkpoints(effort: Effort, device: Any) -> Row:
     """Time the way back with and without checkpoints, from small images to large ones, and compare the gradients."""
     rows: list[Row] = []
@@ -518,7 +536,7 @@ def sections(effort: Effort, device: Any) -> dict[str, Callable[[Any], Iterator[
         "growth": measure_growth,
     }
     if device.is_cuda:
-        found = {"peer": measure_peer, **found, "checkpoints": measure_checkpoints}
+        found = {"peer": measure_peer, **found, "sizes": measure_sizes, "checkpoints": measure_checkpoints}
     return {name: once(partial(section, effort)) for name, section in found.items()}
 
 
