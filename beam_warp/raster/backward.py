@@ -37,12 +37,12 @@ class BackwardBuffers:
             self.images = RasterImages(tuple(rows.matrix for rows in self._adjoints), *flat)
             lengths = [pair_length(rows.length, drawn.exact) for rows in self._adjoints]
             self._sums = [wp.zeros((splat_count, length), dtype=float) for length in lengths]
-            self._splats, self._records = drawn.zero_splats()
+            self._splats = drawn.zero_splats()
             self._blocks = drawn.zero_blocks(len(drawn.channels.values), self._splats.normals)
             geometry = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec3, wp.quat, wp.vec3, float)]
             self.gaussians = GaussianGradients(*geometry, values=self._blocks.values if drawn.channels.values else None)
             # Their own: the adjoint projects anew and writes them, with other roundings than those that were drawn.
-            self._tracked = _with_gradients(drawn.zero_splats()[0], self._splats)
+            self._tracked = _with_gradients(drawn.zero_splats(), self._splats)
         self._cameras: CameraBuffers | None = None
 
     def begin(self, gaussians: GaussianArrays) -> None:
@@ -51,7 +51,9 @@ class BackwardBuffers:
             held = self.gaussians.radiance
             if held is None or held.shape != gaussians.radiance.shape:
                 self.gaussians = self.gaussians._replace(radiance=wp.zeros_like(gaussians.radiance))
-        for array in (*self.gaussians[:4], self.gaussians.radiance, *self._sums, self._records):
+        splats = self._splats
+        summed = (*self.gaussians[:4], self.gaussians.radiance, *self._sums)
+        for array in (*summed, splats.centers, splats.shapes, splats.slopes, splats.bends):
             if array is not None:
                 array.zero_()
 

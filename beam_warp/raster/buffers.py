@@ -141,19 +141,13 @@ class FrameBuffers:
         if self.device.is_cuda:
             self.frame.lists.summed.zero_()
 
-    def zero_splats(self) -> tuple[Splats, wp.array]:
-        """Allocate splats on the current device, with normals if they are drawn.
-
-        Returns:
-            Splats, and the array where all but their normals lie, 64 bytes a splat: whatever lists name is read in any
-            order, and a device reads 32 bytes at least.
-        """
-        splats, count = Splats(), self.splat_count
-        records = wp.zeros((max(count, 1), 4), dtype=wp.vec4)  # a slice of nothing is refused
-        splats.centers, splats.shapes, splats.slopes = (records[:count, k] for k in range(3))
-        splats.bends = wp.array(ptr=records.ptr, shape=(len(records), 16), dtype=float)[:count, 12]
-        splats.normals = wp.zeros(count if self.channels.normals else 0, dtype=wp.vec3)
-        return splats, records
+    def zero_splats(self) -> Splats:
+        """Allocate splats on the current device, with normals if they are drawn."""
+        splats = Splats()
+        for name, dtype in {"centers": wp.vec4, "shapes": wp.vec4, "slopes": wp.vec4, "bends": float}.items():
+            setattr(splats, name, wp.zeros(self.splat_count, dtype=dtype))
+        splats.normals = wp.zeros(self.splat_count if self.channels.normals else 0, dtype=wp.vec3)
+        return splats
 
     def zero_blocks(self, value_count: int, normals: wp.array) -> ChannelBlocks:
         """Return where channels come from or their gradients go: values and colours of their own, normals if drawn."""
@@ -176,7 +170,7 @@ class FrameBuffers:
     def _allocate_splats(self) -> None:
         """Allocate splats, their channels and their order."""
         count = self.splat_count
-        self.splats, _ = self.zero_splats()
+        self.splats = self.zero_splats()
         self.rows = channel_rows(count, self.channels.count, self.device)
         self.blocks = self.zero_blocks(0, self.splats.normals)
         sorts = not self.device.is_cuda

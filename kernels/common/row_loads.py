@@ -21,20 +21,6 @@ def load_row(rows: wp.array[wp.vec4], index: int) -> wp.vec4:
 
 
 @wp.func_native("""
-    const char* place = reinterpret_cast<const char*>(rows.data) + size_t(index) * rows.strides[0];
-#if defined(__CUDA_ARCH__)
-    const float4 row = __ldg(reinterpret_cast<const float4*>(place));
-    return wp::vec4(row.x, row.y, row.z, row.w);
-#else
-    return *reinterpret_cast<const wp::vec4*>(place);
-#endif
-""")
-def load_apart_row(rows: wp.array[wp.vec4], index: int) -> wp.vec4:
-    """Return ``rows[index]`` of rows that may lie apart, each at a multiple of 16 bytes."""
-    ...
-
-
-@wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const int4 row = __ldg(reinterpret_cast<const int4*>(rows.data) + index);
     return wp::vec4i(row.x, row.y, row.z, row.w);

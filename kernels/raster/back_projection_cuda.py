@@ -22,7 +22,7 @@ from beam_warp.kernels.common.lanes import (
     wait_for_block,
 )
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.common.row_loads import load_apart_row
+from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.composite_adjoint_cuda import PART, THREADS, WARPS
@@ -83,9 +83,9 @@ def back_project_cuda_kernel(channel_count: int):
                 splat = frame.lists.splats[mine]
                 frame.lists.summed[slot] = wp.uint8(1)
                 if part == 0:
-                    share_row(1, CENTER, lane, load_apart_row(frame.splats.centers, splat))
+                    share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
                 if part == 1:
-                    share_row(1, SHAPE, lane, load_apart_row(frame.splats.shapes, splat))
+                    share_row(1, SHAPE, lane, load_row(frame.splats.shapes, splat))
             sum_block(BEGIN_SUMS, slot, Channels(), out_pairs)
             wait_for_block()
             wanted = int(0)

@@ -15,7 +15,7 @@ pass stores its gradient: the slots of a splat lie side by side.
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
-from beam_warp.kernels.common.row_loads import load_apart_row
+from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.project import RasterView, Splats
 from beam_warp.kernels.raster.splat_rows import (
     EXTENT_MARGIN,
@@ -120,7 +120,7 @@ def tile_columns(center: wp.vec4, shape: wp.vec4, view: RasterView, box: wp.vec4
 def key_splats_kernel(first: int, splats: Splats, out_keys: wp.array[int], out_order: wp.array[int]):
     """Depth of each splat as a sorting key; those that are not drawn come last."""
     splat = first + wp.tid()
-    center = load_apart_row(splats.centers, splat)
+    center = load_row(splats.centers, splat)
     key = int(0x7F800000)  # infinity
     if center[2] > -wp.inf:
         key = wp.cast(center[3], int)  # the bits of a positive float sort like an integer
@@ -140,8 +140,8 @@ def count_pairs_kernel(
 ):
     place = first + wp.tid()
     splat = order[place]
-    center = load_apart_row(splats.centers, splat)
-    shape = load_apart_row(splats.shapes, splat)
+    center = load_row(splats.centers, splat)
+    shape = load_row(splats.shapes, splat)
     view = views[splat / gaussian_count]
     box = tile_box(center, shape, view, band)
     count = int(0)
@@ -169,8 +169,8 @@ def emit_pairs_kernel(
     end = wp.min(order.ends[place], out_pairs.owners.shape[0])
     slot = order.ends[place] - count
     splat = order.splats[place]
-    center = load_apart_row(splats.centers, splat)
-    shape = load_apart_row(splats.shapes, splat)
+    center = load_row(splats.centers, splat)
+    shape = load_row(splats.shapes, splat)
     view = views[splat / gaussian_count]
     box = tile_box(center, shape, view, band)
     for row in range(box[1], box[3]):

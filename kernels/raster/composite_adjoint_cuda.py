@@ -28,7 +28,7 @@ from beam_warp.kernels.common.lanes import (
     wait_for_block,
 )
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.common.row_loads import load_apart_row
+from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Checkpoints, Images, PixelPlace, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.composite_adjoint import (
@@ -126,11 +126,11 @@ def share_splat_function(channel_count: int, exact: bool):
     @wp.func
     def share_splat(part: int, lane: int, frame: RasterFrame, channels: wp.array[Channels], splat: int):
         if part == 0:
-            share(PUT_ROW, CENTER, lane, load_apart_row(frame.splats.centers, splat), channels, 0)
+            share(PUT_ROW, CENTER, lane, load_row(frame.splats.centers, splat), channels, 0)
         if part == 1:
-            share(PUT_ROW, SHAPE, lane, load_apart_row(frame.splats.shapes, splat), channels, 0)
+            share(PUT_ROW, SHAPE, lane, load_row(frame.splats.shapes, splat), channels, 0)
         if part == 2:
-            share(PUT_ROW, SLOPE, lane, load_apart_row(frame.splats.slopes, splat), channels, 0)
+            share(PUT_ROW, SLOPE, lane, load_row(frame.splats.slopes, splat), channels, 0)
         if part == 3:
             share(PUT_CHANNELS, 0, lane, wp.vec4(), channels, splat)
             if wp.static(exact):

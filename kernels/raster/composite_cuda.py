@@ -25,7 +25,7 @@ from beam_warp.kernels.common.lanes import (
     wait_for_warp,
 )
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.common.row_loads import load_apart_row
+from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE, TileLists
 from beam_warp.kernels.raster.composite import Checkpoints, Images, PixelPlace, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
@@ -164,7 +164,7 @@ def splat_row(rows: wp.array[wp.vec4], splat: int, otherwise: wp.vec4) -> wp.vec
     """The row of a splat, or another one where there is none."""
     row = otherwise
     if splat >= 0:
-        row = load_apart_row(rows, splat)
+        row = load_row(rows, splat)
     return row
 
 
@@ -256,7 +256,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                 if wanted != 0:
                     mine = i + bits_below_lane(waiting)
                     limits = depth_limits(center, shape, frame.near)
-                    slope = load_apart_row(frame.splats.slopes, splat)
+                    slope = load_row(frame.splats.slopes, splat)
                     if wp.static(exact):
                         bend = wp.vec4(frame.splats.bends[splat], 0.0, limits[0], limits[1])
                         share(PUT_ROW, BEND, mine, bend, channels, 0)

@@ -65,7 +65,7 @@ class Projection:
 
 @wp.struct
 class Splats:
-    """Splats of every (view, Gaussian), view by view; numbers of a splat lie side by side in memory.
+    """Splats of every (view, Gaussian), view by view.
 
     A splat that is not drawn has an opacity of 0. With d the pixel's offset from the centre, alpha is
     exp(ln o - (e0^2 + e1^2) / 2), e0 = s0 dx, e1 = s2 (dy - s1 dx).

@@ -12,7 +12,7 @@ import re
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
-from beam_warp.kernels.common.row_loads import load_apart_row
+from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import Band, SplatOrder, TileLists, tile_box, tile_columns
 from beam_warp.kernels.raster.project import CameraMove, Projection, RasterView, Splats, project_still
 
@@ -148,8 +148,8 @@ def emit_entries_kernel(
         return
     end = wp.min(order.ends[splat], out_lists.owners.shape[0])
     slot = order.ends[splat] - count
-    center = load_apart_row(splats.centers, splat)
-    shape = load_apart_row(splats.shapes, splat)
+    center = load_row(splats.centers, splat)
+    shape = load_row(splats.shapes, splat)
     view = views[splat / gaussian_count]
     box = tile_box(center, shape, view, band)
     depth = wp.uint64(wp.cast(center[3], int)) << wp.uint64(32)  # bits of a positive float sort like an integer
