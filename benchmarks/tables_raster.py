@@ -9,7 +9,7 @@ from raster_plot import draw_growth, draw_stages
 from tables import Row, Rows, cell, figure, number, table
 
 H200, CPU, NEWER = "raster_h200.json", "raster_cpu.json", "raster_gsplat16_h200.json"
-SHARED, FRAMES = "raster_checkpoints_h200.json", "raster_frames_h200.json"
+SHARED, EXACT = "raster_checkpoints_h200.json", "raster_accuracy_h200.json"
 
 CASES = ("RGB and depth", "11 channels and depth")
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
@@ -41,7 +41,7 @@ def speed(result: Row, newer: Row) -> Rows:
     return rows
 
 
-@table("raster_accuracy", H200, CPU)
+@table("raster_accuracy", EXACT, CPU)
 def accuracy(result: Row, on_cpu: Row) -> Rows:
     """Return errors against float64 brute force."""
     asked = {
@@ -77,16 +77,6 @@ def frames(result: Row, on_cpu: Row) -> Rows:
     rows = [[f"{result['frames']['channels']} channels, both depths", "H200 [ms]", "one CPU core, relative"]]
     for name, entry in there.items():
         rows.append([name, cell(entry["device_ms"], ".2f"), cell(here[name]["process_ms"], ".2f", factor=1.0 / unit)])
-    return rows
-
-
-@table("raster_sizes", SHARED)
-def sizes(result: Row) -> Rows:
-    """Return the time of frames over the number of Gaussians."""
-    rows = [["Gaussians", "pairs", "forward [ms]", "backward [ms]"]]
-    for entry in result["sizes"]["rows"]:
-        times = (cell(entry[part]["device_ms"], ".2f") for part in ("forward", "backward"))
-        rows.append([f"{entry['scene']['splats']:,}", f"{entry['pairs']:,}", *times])
     return rows
 
 

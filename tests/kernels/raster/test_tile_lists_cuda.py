@@ -102,7 +102,7 @@ def test_tiles_have_their_room_and_their_turn(rng, tile_count, room):
 
 
 def test_every_pair_that_is_counted_is_emitted(rng):
-    """Ellipses whose left end in a row of tiles is where a column begins: the last bit says which columns they reach.
+    """Ellipses that begin where a tile does, to the left or above: the last bit says which tiles they reach.
 
     One kernel counts, another emits. A pair that only one of them finds leaves an entry of an earlier frame in a list,
     so that images differ from run to run.
@@ -124,16 +124,19 @@ def test_every_pair_that_is_counted_is_emitted(rng):
     scales = np.exp(rng.uniform(np.log(0.001), np.log(0.02), (count, 3)))
     rest = ((rng.normal(size=(count, 4)), wp.quat), (scales, wp.vec3), (rng.uniform(0.1, 1.0, count), float))
     shapes_of = [wp.array(values, dtype=dtype, device=device) for values, dtype in rest]
-    row_of = rng.integers(-1, 2, count)
+    row_of, is_above = rng.integers(-1, 2, count), rng.uniform(size=count) < 0.5
     for _ in range(5):  # each time closer, until positions cannot say it better
         tallies.zero_()
         gaussians = (wp.array(positions, dtype=wp.vec3, device=device), *shapes_of)
         launch_project_entries(gaussians, views, projection, band, splats, order.counts, tallies, device)
         centers, shapes = (rows.numpy().astype(np.float64) for rows in (splats.centers, splats.shapes))
+        squared = 2.0 * (float(LOG_CUT) + centers[:, 2])
         top = (np.floor(centers[:, 1] / SIDE) + row_of) * SIDE + 0.5 - centers[:, 1]
-        left = centers[:, 0] + _left_end(shapes, 2.0 * (float(LOG_CUT) + centers[:, 2]), top, top + SIDE - 1.0)
-        shift = (np.round((left + 0.5) / SIDE) * SIDE - 0.5 - left) * centers[:, 3] / camera.focal_x
-        positions += np.where(np.isfinite(shift), shift, 0.0)[:, None] * camera.world_to_camera[0, :3]
+        left = centers[:, 0] + _left_end(shapes, squared, top, top + SIDE - 1.0)
+        begin = np.where(is_above, centers[:, 1] - _reach_of_rows(shapes, squared), left)
+        shift = (np.round((begin + 0.5) / SIDE) * SIDE - 0.5 - begin) * centers[:, 3] / camera.focal_x
+        axes = np.where(is_above[:, None], camera.world_to_camera[1, :3], camera.world_to_camera[0, :3])
+        positions += np.where(np.isfinite(shift), shift, 0.0)[:, None] * axes
     wp.utils.array_scan(order.counts, order.ends, inclusive=True)
     pairs = int(order.ends.numpy()[-1])
     lists.ranges, lists.order = zeros(tile_count, wp.vec2i), zeros(tile_count)
@@ -157,3 +160,10 @@ def _left_end(shapes, squared, top, bottom):
     half = np.sqrt(np.maximum(k * squared - (s0 * s2 * y) ** 2, 0.0))
     left, right = (e * s2 * y - half) / k, (e * s2 * y + half) / k
     return left - float(RELATIVE_MARGIN) * np.maximum(np.abs(left), np.abs(right)) - float(EXTENT_MARGIN)
+
+
+def _reach_of_rows(shapes, squared):
+    """Largest distance along y of ellipses from their centres, with the margins that belong to it."""
+    s0, s1, s2, _ = shapes.T
+    reach = np.sqrt(squared * (s0 * s0 + (s1 * s2) ** 2)) / (s0 * s2)
+    return reach * (1.0 + float(RELATIVE_MARGIN)) + float(EXTENT_MARGIN)
