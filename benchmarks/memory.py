@@ -68,7 +68,7 @@ class Witness:
         if self.device.is_cuda:
             wp.synchronize_device(self.device)
             self.allocated.append(wp.get_mempool_used_mem_current(self.device))
-        if done % 10 == 0 or done == total:
+        if done % 50 == 0 or done == total:
             self.keep(self.result())
 
     def result(self) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def test_compiles_for_sm_90(compiled, name):
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler there")
 def test_kernels_that_must_agree_round_every_operation(tmp_path):
-    """Of what counts pairs and what emits them no product is fused with a sum: which one is depends on the kernel."""
+    """No product is fused with a sum where pairs are counted and emitted: which one is depends on the kernel."""
     import warp as wp
 
     from beam_warp.kernels.raster import tile_lists_cuda
