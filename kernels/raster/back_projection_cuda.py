@@ -91,11 +91,7 @@ def back_project_cuda_kernel(channel_count: int):
             wanted = int(0)
             if mine < own_end:
                 wanted = reaches(
-                    share_row(0, CENTER, lane, wp.vec4()),
-                    share_row(0, SHAPE, lane, wp.vec4()),
-                    box.position,
-                    PART,
-                    PART,
+                    share_row(0, CENTER, lane, wp.vec4()), share_row(0, SHAPE, lane, wp.vec4()), box.position
                 )
             waiting = ballot(wanted)
             while waiting != 0:

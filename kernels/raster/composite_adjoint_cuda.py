@@ -216,9 +216,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
             wait_for_block()
             wanted = int(0)
             if splat >= 0 and mine < own_end:
-                wanted = reaches(
-                    shared_row(CENTER, lane, channels), shared_row(SHAPE, lane, channels), box.position, PART, PART
-                )
+                wanted = reaches(shared_row(CENTER, lane, channels), shared_row(SHAPE, lane, channels), box.position)
             waiting = ballot(wanted)
             while waiting != 0:
                 i = lowest_lane(waiting)

@@ -64,16 +64,16 @@ CENTER, SHAPE, SLOPE, BEND = (wp.constant(k) for k in range(4))
 
 
 @wp.func
-def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, width: int, height: int) -> int:
-    """1 if a splat reaches a box of pixels, ``first`` being the centre of its first one.
+def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2) -> int:
+    """1 if a splat reaches the pixels of a warp, ``first`` being the centre of the first one.
 
-    Where the box, a little enlarged, does not hold the splat's centre, its least squared distance in standard
+    Where their box, a little enlarged, does not hold the splat's centre, its least squared distance in standard
     deviations is on one of the two sides that face the centre. No root and no exact quotient is needed.
     """
     x0 = first[0] - center[0]
     y0 = first[1] - center[1]
-    x1 = x0 + float(width - 1)
-    y1 = y0 + float(height - 1)
+    x1 = x0 + float(PART - 1)
+    y1 = y0 + float(PART - 1)
     farthest = wp.max(wp.max(-x0, x1), wp.max(-y0, y1))
     margin = RELATIVE_MARGIN * farthest + EXTENT_MARGIN
     x0 -= margin
@@ -249,7 +249,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     row += APART * SIDE
                     out_checkpoints.states[row] = wp.vec4(lower.transmittance, lower.weight, lower.depth, 0.0)
                     out_passed[row] = lower_total
-                wanted = reaches(center, shape, box, PART, PART)
+                wanted = reaches(center, shape, box)
                 waiting = ballot(wanted)
                 wait_for_warp()  # until all its lanes are done with the group before
                 i = part * LANES

@@ -21,7 +21,7 @@ def look_at_boxes_kernel(
         pixel = firsts[i] + wp.vec2(float(k % PART), float(k / PART))
         if log_alpha_of(centers[i], whiten(shapes[i], offset_from(centers[i], pixel))) >= -LOG_CUT:
             counted += 1
-    out_found[i] = wp.vec2i(counted, reaches(centers[i], shapes[i], firsts[i], PART, PART))
+    out_found[i] = wp.vec2i(counted, reaches(centers[i], shapes[i], firsts[i]))
 
 
 def test_no_pixel_that_counts_is_passed_over(rng):
