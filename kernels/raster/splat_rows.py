@@ -159,10 +159,26 @@ def whiten(shape: wp.vec4, offset: wp.vec2) -> wp.vec2:
     return wp.vec2(offset[0] * shape[0], (offset[1] - shape[1] * offset[0]) * shape[2])
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __fmaf_rn(-0.5f, __fmaf_rn(e[0], e[0], __fmul_rn(e[1], e[1])), log_opacity);
+#else
+    return log_opacity - 0.5f * (e[0] * e[0] + e[1] * e[1]);
+#endif
+""")
+def log_of_response(log_opacity: float, e: wp.vec2) -> float:
+    """Logarithm of opacity times response at an offset in standard deviations.
+
+    It says which splats count for a pixel. On CUDA it leaves no choice of which product to fuse: a kernel that draws
+    and one that goes back must find the same splats.
+    """
+    ...
+
+
 @wp.func
 def log_alpha_of(center: wp.vec4, e: wp.vec2) -> float:
     """Logarithm of opacity times response."""
-    return center[2] - 0.5 * (e[0] * e[0] + e[1] * e[1])
+    return log_of_response(center[2], e)
 
 
 @wp.func
