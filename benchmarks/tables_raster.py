@@ -9,7 +9,7 @@ from raster_plot import draw_growth, draw_stages
 from tables import Row, Rows, cell, figure, number, table
 
 H200, CPU, NEWER = "raster_h200.json", "raster_cpu.json", "raster_gsplat16_h200.json"
-SHARED, EXACT = "raster_checkpoints_h200.json", "raster_accuracy_h200.json"
+SHARED, ACCURACY = "raster_checkpoints_h200.json", "raster_accuracy_h200.json"
 
 CASES = ("RGB and depth", "11 channels and depth")
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
@@ -41,7 +41,7 @@ def speed(result: Row, newer: Row) -> Rows:
     return rows
 
 
-@table("raster_accuracy", EXACT, CPU)
+@table("raster_accuracy", ACCURACY, CPU)
 def accuracy(result: Row, on_cpu: Row) -> Rows:
     """Return errors against float64 brute force."""
     asked = {

@@ -3,7 +3,6 @@
 Nothing here does anything sensible on the CPU, where a thread is alone; the kernels that call it are for CUDA.
 """
 
-import re
 from functools import cache
 
 import warp as wp
@@ -147,14 +146,14 @@ _SHARE_SPLATS = """
         found[4 * i + 2] = part.z;
         found[4 * i + 3] = part.w;
     };
-    if (action == PUT_ROW) {
+    if (action == 0) {
         place[kind * COUNT] = make_float4(row[0], row[1], row[2], row[3]);
-    } else if (action == PUT_CHANNELS) {
+    } else if (action == 1) {
         const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(splat) * (LENGTH / 4);
         #pragma unroll
         for (int i = 0; i < LENGTH / 4; ++i)
             place[(KINDS + i) * COUNT] = __ldg(source + i);
-    } else if (action == ROW) {
+    } else if (action == 2) {
         get(0, place[kind * COUNT]);
     } else {
         #pragma unroll
@@ -238,8 +237,10 @@ PUT_ROW, PUT_CHANNELS, ROW, CHANNELS = (wp.constant(k) for k in range(4))
 
 
 @cache
-def share_splats_function(Channels, kinds: int, count: int):
-    """Return the function that keeps ``count`` splats in shared memory: some kinds of rows, and channels.
+def share_splats_functions(Channels, kinds: int, count: int):
+    """Return the function that keeps ``count`` splats in shared memory, and one that takes a row from there.
+
+    A splat has some kinds of rows, and channels. The first function does one of these:
 
     - `PUT_ROW` writes a row.
     - `PUT_CHANNELS` copies a splat's channels.
@@ -248,17 +249,20 @@ def share_splats_function(Channels, kinds: int, count: int):
 
     All is one array, so that one register tells where a splat is.
     """
-    length = Channels._length_
-    names = {"PUT_CHANNELS": PUT_CHANNELS, "PUT_ROW": PUT_ROW, "ROW": ROW}
-    numbers = {**names, "LENGTH": length, "KINDS": kinds, "COUNT": count}
-    snippet = re.sub("|".join(numbers), lambda name: str(int(numbers[name[0]])), _SHARE_SPLATS)
+    snippet = _SHARE_SPLATS.replace("LENGTH", str(Channels._length_))
+    snippet = snippet.replace("KINDS", str(kinds)).replace("COUNT", str(count))
 
     @wp.func_native(snippet)
     def share_splats(
         action: int, kind: int, index: int, row: wp.vec4, channels: wp.array[Channels], splat: int
     ) -> Channels: ...
 
-    return share_splats
+    @wp.func
+    def shared_row(kind: int, index: int, channels: wp.array[Channels]) -> wp.vec4:
+        row = share_splats(ROW, kind, index, wp.vec4(), channels, 0)
+        return wp.vec4(row[0], row[1], row[2], row[3])
+
+    return share_splats, shared_row
 
 
 BEGIN_SUMS, ADD_TO_SUMS, END_SUMS = (wp.constant(k) for k in range(3))

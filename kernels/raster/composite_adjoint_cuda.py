@@ -24,6 +24,7 @@ from beam_warp.kernels.common.lanes import (
     greatest_of_block,
     greatest_of_lanes,
     lowest_lane,
+    share_splats_functions,
     sum_block_function,
     wait_for_block,
 )
@@ -39,17 +40,7 @@ from beam_warp.kernels.raster.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.raster.composite_cuda import (
-    BEND,
-    CENTER,
-    LANES,
-    PART,
-    SHAPE,
-    SLOPE,
-    STRIDE,
-    reaches,
-    shared_splats_functions,
-)
+from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, PART, SHAPE, SLOPE, STRIDE, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, sight_of
 
@@ -121,7 +112,7 @@ def cut_function(channel_count: int):
 def share_splat_function(channel_count: int, exact: bool):
     """Return the function that brings a splat to shared memory, a part of it by each warp."""
     Channels = channel_vector(channel_count)
-    share, _ = shared_splats_functions(channel_count, exact, LANES)
+    share, _ = share_splats_functions(Channels, 4 if exact else 3, LANES)
 
     @wp.func
     def share_splat(part: int, lane: int, frame: RasterFrame, channels: wp.array[Channels], splat: int):
@@ -145,7 +136,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
     add_pixel = add_pixel_function(channel_count, exact)
-    share, shared_row = shared_splats_functions(channel_count, exact, LANES)
+    share, shared_row = share_splats_functions(Channels, 4 if exact else 3, LANES)
     share_splat = share_splat_function(channel_count, exact)
     cut = cut_function(channel_count)
     sum_block = sum_block_function(pair_length(channel_count, exact), WARPS)

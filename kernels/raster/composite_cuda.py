@@ -16,12 +16,11 @@ from beam_warp.kernels.common.lanes import (
     CHANNELS,
     PUT_CHANNELS,
     PUT_ROW,
-    ROW,
     any_of_block,
     ballot,
     bits_below_lane,
     count_bits,
-    share_splats_function,
+    share_splats_functions,
     wait_for_warp,
 )
 from beam_warp.kernels.common.launching import launch
@@ -169,20 +168,6 @@ def splat_row(rows: wp.array[wp.vec4], splat: int, otherwise: wp.vec4) -> wp.vec
 
 
 @cache
-def shared_splats_functions(channel_count: int, exact: bool, count: int):
-    """Return the function that keeps ``count`` splats in shared memory, and the one that takes a row from there."""
-    Channels = channel_vector(channel_count)
-    share = share_splats_function(Channels, 4 if exact else 3, count)
-
-    @wp.func
-    def shared_row(kind: int, index: int, channels: wp.array[Channels]) -> wp.vec4:
-        row = share(ROW, kind, index, wp.vec4(), channels, 0)
-        return wp.vec4(row[0], row[1], row[2], row[3])
-
-    return share, shared_row
-
-
-@cache
 def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True):
     """Return the kernel that composites ``channel_count`` channels, two pixels an item; unless ``colored``, none.
 
@@ -190,7 +175,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
     """
     Channels = channel_vector(channel_count)
     depth_at = limited_depth_function(exact)
-    share, shared_row = shared_splats_functions(channel_count, exact, THREADS)
+    share, shared_row = share_splats_functions(Channels, 4 if exact else 3, THREADS)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=(THREADS, BLOCKS), grid_stride=False)
     def composite_blocks_kernel(

@@ -7,8 +7,6 @@ many more as its pixels look at: where the front hides the rest, most of a long 
 Entries are emitted by atomics, in any order; once they are sorted nothing of it is left.
 """
 
-import re
-
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
@@ -110,8 +108,8 @@ def project_entries_kernel(
 #endif
     return places;
 """.replace("AHEAD", str(AHEAD))
-    .replace("SPREAD", str(int(SPREAD)))
-    .replace("EMITTED", str(int(EMITTED)))
+    .replace("SPREAD", str(SPREAD))
+    .replace("EMITTED", str(EMITTED))
 )
 def take_places(tallies: wp.array[int], tile: int, count: int) -> Places:
     """Places of an entry in the lists of ``count`` tiles side by side, at most `AHEAD`."""
@@ -421,10 +419,10 @@ _SORT_ENTRIES = """
 """
 
 
-_NUMBERS = {"SORTED": SORTED, "FEW": FEW, "THREADS": int(THREADS), "BITS": int(THREADS).bit_length() - 1}
+_SORT_ENTRIES = _SORT_ENTRIES.replace("THREADS", str(THREADS)).replace("BITS", str(THREADS.bit_length() - 1))
 
 
-@wp.func_native(re.sub("|".join(_NUMBERS), lambda name: str(_NUMBERS[name[0]]), _SORT_ENTRIES))
+@wp.func_native(_SORT_ENTRIES.replace("SORTED", str(SORTED)).replace("FEW", str(FEW)))
 def sort_entries(
     entries: wp.array[wp.uint64],
     owners: wp.array[int],

@@ -119,7 +119,7 @@ def test_every_pair_that_is_counted_is_emitted(rng):
     for name, dtype in {"centers": wp.vec4, "shapes": wp.vec4, "slopes": wp.vec4, "bends": float}.items():
         setattr(splats, name, zeros(count, dtype))
     splats.normals = zeros(0, wp.vec3)
-    order.counts, order.ends, tallies = zeros(count), zeros(count), zeros(tile_count * int(SPREAD))
+    order.counts, order.ends, tallies = zeros(count), zeros(count), zeros(tile_count * SPREAD)
     positions = rng.uniform(-0.4, 0.4, (count, 3))
     scales = np.exp(rng.uniform(np.log(0.001), np.log(0.02), (count, 3)))
     rest = ((rng.normal(size=(count, 4)), wp.quat), (scales, wp.vec3), (rng.uniform(0.1, 1.0, count), float))
@@ -130,7 +130,7 @@ def test_every_pair_that_is_counted_is_emitted(rng):
         gaussians = (wp.array(positions, dtype=wp.vec3, device=device), *shapes_of)
         launch_project_entries(gaussians, views, projection, band, splats, order.counts, tallies, device)
         centers, shapes = (rows.numpy().astype(np.float64) for rows in (splats.centers, splats.shapes))
-        squared = 2.0 * (float(LOG_CUT) + centers[:, 2])
+        squared = 2.0 * (LOG_CUT + centers[:, 2])
         top = (np.floor(centers[:, 1] / SIDE) + row_of) * SIDE + 0.5 - centers[:, 1]
         left = centers[:, 0] + _left_end(shapes, squared, top, top + SIDE - 1.0)
         begin = np.where(is_above, centers[:, 1] - _reach_of_rows(shapes, squared), left)
@@ -143,7 +143,7 @@ def test_every_pair_that_is_counted_is_emitted(rng):
     lists.owners, lists.entries = zeros(pairs), zeros(pairs, wp.uint64)
     launch_plan_tiles(tallies, tile_count, pairs, lists, device)
     launch_emit_entries(order, splats, views, count, band, tallies, lists, device)
-    counted, emitted = tallies.numpy().reshape(tile_count, -1)[:, [0, int(EMITTED)]].T
+    counted, emitted = tallies.numpy().reshape(tile_count, -1)[:, [0, EMITTED]].T
     assert pairs > 2 * count
     assert np.median(np.abs(shift)) < 1e-5
     np.testing.assert_array_equal(emitted, counted)
@@ -159,11 +159,11 @@ def _left_end(shapes, squared, top, bottom):
     y = np.clip(-np.sqrt(squared) * s1 / s0, top, bottom)
     half = np.sqrt(np.maximum(k * squared - (s0 * s2 * y) ** 2, 0.0))
     left, right = (e * s2 * y - half) / k, (e * s2 * y + half) / k
-    return left - float(RELATIVE_MARGIN) * np.maximum(np.abs(left), np.abs(right)) - float(EXTENT_MARGIN)
+    return left - RELATIVE_MARGIN * np.maximum(np.abs(left), np.abs(right)) - EXTENT_MARGIN
 
 
 def _reach_of_rows(shapes, squared):
     """Largest distance along y of ellipses from their centres, with the margins that belong to it."""
     s0, s1, s2, _ = shapes.T
     reach = np.sqrt(squared * (s0 * s0 + (s1 * s2) ** 2)) / (s0 * s2)
-    return reach * (1.0 + float(RELATIVE_MARGIN)) + float(EXTENT_MARGIN)
+    return reach * (1.0 + RELATIVE_MARGIN) + EXTENT_MARGIN
