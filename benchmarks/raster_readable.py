@@ -13,7 +13,15 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import MEDIAN, alpha_of, depth_function, log_alpha_of, offset_from, whiten
+from beam_warp.kernels.raster.splat_rows import (
+    MEDIAN,
+    alpha_of,
+    behind,
+    depth_function,
+    log_alpha_of,
+    offset_from,
+    whiten,
+)
 from beam_warp.raster.forward import composite
 from beam_warp.raster.rasterizer import Rasterizer
 
@@ -77,7 +85,7 @@ def composite_kernel(channel_count: int, exact: bool):
                     median = k
                 last = splat % frame.gaussian_count
                 end = k + 1
-                transmittance *= 1.0 - alpha
+                transmittance = behind(transmittance, alpha)
                 if transmittance < TRANSMITTANCE_STOP:
                     break
         out_channels[pixel] = total

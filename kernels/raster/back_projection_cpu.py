@@ -12,7 +12,15 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector
 from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_pixels
 from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_from, row_reach, squared_extent, whiten
+from beam_warp.kernels.raster.splat_rows import (
+    alpha_of,
+    behind,
+    log_alpha_of,
+    offset_from,
+    row_reach,
+    squared_extent,
+    whiten,
+)
 
 
 @cache
@@ -61,7 +69,7 @@ def back_project_cpu_kernel(channel_count: int):
                     alpha = alpha_of(log_alpha)
                     transmittance = images.states[pixel][0]
                     total += pixels[pixel] * (alpha * transmittance)
-                    images.states[pixel] = wp.vec4(transmittance * (1.0 - alpha), 0.0, 0.0, 0.0)
+                    images.states[pixel] = wp.vec4(behind(transmittance, alpha), 0.0, 0.0, 0.0)
             out_pairs[frame.lists.slots[k]] = total
 
     return back_project_tiles_kernel

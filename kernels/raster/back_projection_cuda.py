@@ -28,7 +28,7 @@ from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vect
 from beam_warp.kernels.raster.composite_adjoint_cuda import PART, THREADS, WARPS
 from beam_warp.kernels.raster.composite_cuda import CENTER, LANES, SHAPE, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import alpha_of, log_alpha_of, offset_from, whiten
+from beam_warp.kernels.raster.splat_rows import alpha_of, behind, log_alpha_of, offset_from, whiten
 
 
 @cache
@@ -111,8 +111,8 @@ def back_project_cuda_kernel(channel_count: int):
                 lower_alpha = wp.where(in_lower, alpha_of(lower_log_alpha), 0.0)
                 total = held_by_upper * (upper_alpha * upper_transmittance)
                 total += held_by_lower * (lower_alpha * lower_transmittance)
-                upper_transmittance *= 1.0 - upper_alpha
-                lower_transmittance *= 1.0 - lower_alpha
+                upper_transmittance = behind(upper_transmittance, upper_alpha)
+                lower_transmittance = behind(lower_transmittance, lower_alpha)
                 sum_block(ADD_TO_SUMS, i, total, out_pairs)
             wait_for_block()
             sum_block(END_SUMS, 0, Channels(), out_pairs)

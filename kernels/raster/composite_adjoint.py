@@ -24,8 +24,10 @@ from beam_warp.kernels.raster.splat_rows import (
     Sight,
     SplatRow,
     bend_at,
-    depth_function,
     facing_at,
+    limited_depth,
+    nearness_function,
+    nearness_limits,
     quick_divide,
 )
 
@@ -84,29 +86,29 @@ def pixel_adjoint(images: Images, adjoints: Adjoints, pixel: int) -> wp.vec3:
 def depth_adjoint_function(exact: bool):
     """Return the function that takes the derivative ``v`` to a splat's depth ``z`` at a pixel apart.
 
-    It gives those to the centre's depth, the reach, the factor l and the form e. It has no branches: in a kernel each
-    would cost a selection for every variable that it changes.
+    ``nearness`` and its limits are those that the depth came of. It gives the derivatives to the centre's depth, the
+    reach, the factor l and the form e. It has no branches: in a kernel each would cost a selection for every variable
+    that it changes.
     """
 
     @wp.func
     def depth_adjoint(
-        center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2, z: float, v: float
+        splat: SplatRow, near: float, offset: wp.vec2, limits: wp.vec2, nearness: float, z: float, v: float
     ) -> wp.vec4:
-        least = center[3] - shape[3]
-        beyond = z >= center[3] + shape[3]
-        before = (not beyond) and z <= wp.max(least, near)
+        beyond = not (nearness > limits[0])
+        before = (not beyond) and nearness >= limits[1]
         clamped = beyond or before
-        held = before and least <= near  # by the near plane, which nothing moves
-        slide = quick_divide(v * z, center[3])
+        held = before and splat.center[3] - splat.shape[3] <= near  # by the near plane, which nothing moves
+        slide = quick_divide(v * z, splat.center[3])
         to_z = wp.where(clamped, wp.where(held, 0.0, v), slide)
         to_reach = wp.where(clamped, wp.where(beyond, v, wp.where(held, 0.0, -v)), 0.0)
         to_facing = wp.where(clamped, 0.0, -slide * z)
         to_bend = float(0.0)
         if wp.static(exact):
-            raw = facing_at(slope, offset)
+            raw = facing_at(splat.slope, offset)
             facing = wp.max(raw, SMALLEST_FACING)
             to_bend = quick_divide(to_facing, facing)
-            to_facing -= quick_divide(to_bend * bend_at(slope, bend, offset), facing)
+            to_facing -= quick_divide(to_bend * bend_at(splat.slope, splat.bend, offset), facing)
             to_facing = wp.where(raw < SMALLEST_FACING, 0.0, to_facing)
         return wp.vec4(to_z, to_reach, to_facing, to_bend)
 
@@ -122,7 +124,7 @@ def add_pixel_function(channel_count: int, exact: bool):
     """
     Channels = channel_vector(channel_count)
     Pair = pair_vector(channel_count, exact)
-    depth_at = depth_function(exact)
+    nearness_at = nearness_function(exact)
     depth_adjoint = depth_adjoint_function(exact)
     bend_start = MOMENTS + channel_count
 
@@ -143,11 +145,13 @@ def add_pixel_function(channel_count: int, exact: bool):
         open_share = 1.0 - alpha
         before = quick_divide(state.transmittance, open_share)
         weight = alpha * before
-        z = depth_at(splat.center, splat.shape, splat.slope, splat.bend, near, sight.offset)
+        limits = nearness_limits(splat.center, splat.shape, near)
+        nearness = nearness_at(splat.slope, splat.bend, sight.offset)
+        z = limited_depth(splat.center[3], limits, nearness)
         s = wp.dot(row, to_channels) + z * adjoint[1] + adjoint[0]
         d = wp.where(alpha < ALPHA_MAX, alpha * (before * s - quick_divide(state.behind, open_share)), 0.0)
         to_depth = weight * adjoint[1] + wp.where(is_median, adjoint[2], 0.0)
-        depth = depth_adjoint(splat.center, splat.shape, splat.slope, splat.bend, near, sight.offset, z, to_depth)
+        depth = depth_adjoint(splat, near, sight.offset, limits, nearness, z, to_depth)
         d0 = d * e[0]
         d1 = d * e[1]
         total[0] = total[0] + d

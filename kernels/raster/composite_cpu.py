@@ -17,6 +17,7 @@ from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
     RowReach,
     alpha_of,
+    behind,
     depth_function,
     end_pixel_at,
     first_pixel_from,
@@ -121,7 +122,7 @@ def composite_cpu_kernel(channel_count: int, exact: bool):
                         median = z
                         out_images.medians[pixel] = k
                     out_images.ends[pixel] = k + 1
-                    transmittance *= 1.0 - alpha
+                    transmittance = behind(transmittance, alpha)
                     out_images.states[pixel] = wp.vec4(transmittance, state[1] + weight, state[2] + z * weight, median)
                     if transmittance < TRANSMITTANCE_STOP:
                         open_pixels -= 1

@@ -33,9 +33,11 @@ from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
     RELATIVE_MARGIN,
     alpha_of,
-    depth_limits,
-    limited_depth_function,
+    behind,
+    limited_depth,
     log_alpha_of,
+    nearness_function,
+    nearness_limits,
     offset_from,
     quick_divide,
     squared_extent,
@@ -126,7 +128,7 @@ def add_splat(sums: PixelSums, seen: bool, alpha: float, weight: float, z: float
     nearer = seen and sums.transmittance > MEDIAN
     sums.median_depth = wp.where(nearer, z, sums.median_depth)
     sums.median = wp.where(nearer, at, sums.median)
-    sums.transmittance *= 1.0 - alpha
+    sums.transmittance = behind(sums.transmittance, alpha)
     return sums
 
 
@@ -174,7 +176,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
     Shadow maps show depth alone. Channels then stay what they were: 0.
     """
     Channels = channel_vector(channel_count)
-    depth_at = limited_depth_function(exact)
+    nearness_at = nearness_function(exact)
     share, shared_row = share_splats_functions(Channels, 4 if exact else 3, THREADS)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=(THREADS, BLOCKS), grid_stride=False)
@@ -240,7 +242,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                 i = part * LANES
                 if wanted != 0:
                     mine = i + bits_below_lane(waiting)
-                    limits = depth_limits(center, shape, frame.near)
+                    limits = nearness_limits(center, shape, frame.near)
                     slope = load_row(frame.splats.slopes, splat)
                     if wp.static(exact):
                         bend = wp.vec4(frame.splats.bends[splat], 0.0, limits[0], limits[1])
@@ -269,7 +271,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     drawn = shared_row(CENTER, k, channels)
                     drawn_shape = shared_row(SHAPE, k, channels)
                     above = offset_from(drawn, upper_place.position)
-                    below = offset_from(drawn, lower_place.position)
+                    below = wp.vec2(above[0], lower_place.position[1] - drawn[1])
                     log_above = log_alpha_of(drawn, whiten(drawn_shape, above))
                     log_below = log_alpha_of(drawn, whiten(drawn_shape, below))
                     in_upper = upper.transmittance >= TRANSMITTANCE_STOP and log_above >= -LOG_CUT
@@ -283,8 +285,8 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     if wp.static(exact):
                         bounds = shared_row(BEND, k, channels)
                     limits = wp.vec2(bounds[2], bounds[3])
-                    upper_z = depth_at(drawn[3], limits, slope, bounds[0], above)
-                    lower_z = depth_at(drawn[3], limits, slope, bounds[0], below)
+                    upper_z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], above))
+                    lower_z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], below))
                     upper_alpha = wp.where(in_upper, alpha_of(log_above), 0.0)
                     lower_alpha = wp.where(in_lower, alpha_of(log_below), 0.0)
                     upper_weight = upper_alpha * upper.transmittance

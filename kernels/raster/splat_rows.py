@@ -161,7 +161,7 @@ def whiten(shape: wp.vec4, offset: wp.vec2) -> wp.vec2:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return __fmaf_rn(-0.5f, __fmaf_rn(e[0], e[0], __fmul_rn(e[1], e[1])), log_opacity);
+    return __fmaf_rn(-0.5f, __fmaf_rn(e[1], e[1], __fmul_rn(e[0], e[0])), log_opacity);
 #else
     return log_opacity - 0.5f * (e[0] * e[0] + e[1] * e[1]);
 #endif
@@ -170,7 +170,7 @@ def log_of_response(log_opacity: float, e: wp.vec2) -> float:
     """Logarithm of opacity times response at an offset in standard deviations.
 
     It says which splats count for a pixel. On CUDA it leaves no choice of which product to fuse: a kernel that draws
-    and one that goes back must find the same splats.
+    and one that goes back must find the same splats. Pixels below each other have one square of e0.
     """
     ...
 
@@ -197,6 +197,18 @@ def alpha_of(log_alpha: float) -> float:
     return wp.min(quick_exp(log_alpha), ALPHA_MAX)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __fmaf_rn(-alpha, transmittance, transmittance);
+#else
+    return transmittance * (1.0f - alpha);
+#endif
+""")
+def behind(transmittance: float, alpha: float) -> float:
+    """What passes a splat, of what passes before it."""
+    ...
+
+
 @wp.func
 def facing_at(slope: wp.vec4, offset: wp.vec2) -> float:
     """The factor l of `kernels.raster.project` at an offset from the centre."""
@@ -212,35 +224,43 @@ def bend_at(slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
 
 
 @wp.func
-def depth_limits(center: wp.vec4, shape: wp.vec4, near: float) -> wp.vec2:
-    """Least and greatest depth of a Gaussian."""
-    return wp.vec2(wp.max(center[3] - shape[3], near), center[3] + shape[3])
+def nearness_limits(center: wp.vec4, shape: wp.vec4, near: float) -> wp.vec2:
+    """Nearness, as of `nearness_function`, of a Gaussian's greatest depth and of its least one."""
+    least = wp.max(center[3] - shape[3], near)
+    return wp.vec2(quick_divide(center[3], center[3] + shape[3]), quick_divide(center[3], least))
 
 
 @cache
-def limited_depth_function(exact: bool):
-    """Return the function that gives a splat's depth at an offset from its centre, between its limits."""
+def nearness_function(exact: bool):
+    """Return the function that tells how near a splat is at an offset: its centre's depth over that there.
+
+    It is that of the plane, or in exact mode that of the largest response. Beyond the plane's horizon it is negative.
+    """
 
     @wp.func
-    def limited_depth_at(depth: float, limits: wp.vec2, slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
-        """Depth of the plane, beyond its horizon the far end; or in exact mode that of the largest response."""
-        inverse = facing_at(slope, offset)
+    def nearness_at(slope: wp.vec4, bend: float, offset: wp.vec2) -> float:
+        nearness = facing_at(slope, offset)
         if wp.static(exact):
-            facing = wp.max(inverse, SMALLEST_FACING)
-            inverse = facing + quick_divide(bend_at(slope, bend, offset), facing)
-        reached = wp.where(inverse > 0.0, wp.min(quick_divide(depth, inverse), limits[1]), limits[1])
-        return wp.max(reached, limits[0])
+            facing = wp.max(nearness, SMALLEST_FACING)
+            nearness = facing + quick_divide(bend_at(slope, bend, offset), facing)
+        return nearness
 
-    return limited_depth_at
+    return nearness_at
+
+
+@wp.func
+def limited_depth(depth: float, limits: wp.vec2, nearness: float) -> float:
+    """Depth of a splat where it is so near, between its limits; at the far one where nearness is not a number."""
+    return quick_divide(depth, wp.clamp(nearness, limits[0], limits[1]))
 
 
 @cache
 def depth_function(exact: bool):
     """Return the function (center, shape, slope, bend, near, offset) that gives a splat's depth at a pixel."""
-    limited_depth_at = limited_depth_function(exact)
+    nearness_at = nearness_function(exact)
 
     @wp.func
     def depth_at(center: wp.vec4, shape: wp.vec4, slope: wp.vec4, bend: float, near: float, offset: wp.vec2) -> float:
-        return limited_depth_at(center[3], depth_limits(center, shape, near), slope, bend, offset)
+        return limited_depth(center[3], nearness_limits(center, shape, near), nearness_at(slope, bend, offset))
 
     return depth_at
