@@ -9,6 +9,9 @@ from beam_warp.kernels.raster.project import Splats
 
 wp.set_module_options({"enable_backward": False})
 
+LN_2 = wp.constant(0.6931471805599453)
+"""Alpha is a power of two: ln alpha is this times log2 o - e0^2 - e1^2."""
+
 
 @wp.kernel
 def sum_pairs_kernel(
@@ -47,8 +50,10 @@ def resolve_sums_kernel(
     facing = sums[splat, 8]
     to_gx = sums[splat, 9] / s0
     to_gy = sums[splat, 10] / s2 + s1 * to_gx
-    to_x = s1 * s2 * sums[splat, 2] - s0 * sums[splat, 1] + facing * slope[0]
-    to_y = -s2 * sums[splat, 2] + facing * slope[1]
+    e0 = 2.0 * LN_2 * sums[splat, 1]
+    e1 = 2.0 * LN_2 * sums[splat, 2]
+    to_x = s1 * s2 * e1 - s0 * e0 + facing * slope[0]
+    to_y = -s2 * e1 + facing * slope[1]
     to_bends = wp.vec3(0.0, 0.0, 0.0)
     if exact != 0:
         column = MOMENTS + channel_count
@@ -62,10 +67,11 @@ def resolve_sums_kernel(
         to_x += 2.0 * (slope[2] * b_x + slope[3] * b_y)
         to_y += 2.0 * (slope[3] * b_x + bend * b_y)
         to_bends = wp.vec3(b_xx, 2.0 * b_xy, b_yy)
-    out_gradients.centers[splat] = out_gradients.centers[splat] + wp.vec4(-to_x, -to_y, sums[splat, 0], sums[splat, 6])
-    out_gradients.shapes[splat] = out_gradients.shapes[splat] + wp.vec4(
-        -sums[splat, 3] / s0, s2 / s0 * sums[splat, 4], -sums[splat, 5] / s2, sums[splat, 7]
-    )
+    to_center = wp.vec4(-to_x, -to_y, LN_2 * sums[splat, 0], sums[splat, 6])
+    out_gradients.centers[splat] = out_gradients.centers[splat] + to_center
+    squares = 2.0 * LN_2 * wp.vec3(-sums[splat, 3] / s0, s2 / s0 * sums[splat, 4], -sums[splat, 5] / s2)
+    to_shape = wp.vec4(squares[0], squares[1], squares[2], sums[splat, 7])
+    out_gradients.shapes[splat] = out_gradients.shapes[splat] + to_shape
     out_gradients.slopes[splat] = out_gradients.slopes[splat] + wp.vec4(to_gx, to_gy, to_bends[0], to_bends[1])
     out_gradients.bends[splat] = out_gradients.bends[splat] + to_bends[2]
 

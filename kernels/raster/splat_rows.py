@@ -35,14 +35,14 @@ class Sight:
     """A splat as one pixel sees it."""
 
     offset: wp.vec2  # from the splat's centre to the pixel [pixel]
-    e: wp.vec2  # the offset in standard deviations
-    log_alpha: float
+    e: wp.vec2  # the whitened offset
+    log_alpha: float  # to the base 2
 
 
 @wp.func
 def squared_extent(log_opacity: float) -> float:
-    """Squared number of standard deviations at which alpha falls to 1/255."""
-    return 2.0 * (LOG_CUT + log_opacity)
+    """Squared length of the whitened offset at which alpha falls to 1/255."""
+    return LOG_CUT + log_opacity
 
 
 @wp.func
@@ -119,17 +119,14 @@ def end_pixel_at(edge: float, limit: int) -> int:
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     float found;
-    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(found) : "f"(__fmul_rn(x, 1.44269504f)));
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(found) : "f"(x));
     return found;
 #else
-    return expf(x);
+    return exp2f(x);
 #endif
 """)
-def quick_exp(x: float) -> float:
-    """The exponential; on CUDA within 2 + |1.16 x| ulp: relative 1.0e-6 for the faintest alpha there is.
-
-    No alpha is a denormal number, so it does without what `__expf` does for them.
-    """
+def quick_exp2(x: float) -> float:
+    """A power of two; on CUDA within 2 ulp, without what `exp2f` does for denormal numbers: no alpha is one."""
     ...
 
 
@@ -155,29 +152,29 @@ def offset_from(center: wp.vec4, position: wp.vec2) -> wp.vec2:
 
 @wp.func
 def whiten(shape: wp.vec4, offset: wp.vec2) -> wp.vec2:
-    """An offset in standard deviations: (e0, e1) of `kernels.raster.project.Splats`."""
+    """A whitened offset: (e0, e1) of `kernels.raster.project.Splats`."""
     return wp.vec2(offset[0] * shape[0], (offset[1] - shape[1] * offset[0]) * shape[2])
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return __fmaf_rn(-0.5f, __fmaf_rn(e[1], e[1], __fmul_rn(e[0], e[0])), log_opacity);
+    return __fmaf_rn(-e[1], e[1], __fmaf_rn(-e[0], e[0], log_opacity));
 #else
-    return log_opacity - 0.5f * (e[0] * e[0] + e[1] * e[1]);
+    return log_opacity - (e[0] * e[0] + e[1] * e[1]);
 #endif
 """)
 def log_of_response(log_opacity: float, e: wp.vec2) -> float:
-    """Logarithm of opacity times response at an offset in standard deviations.
+    """Logarithm to the base 2 of opacity times response at a whitened offset.
 
     It says which splats count for a pixel. On CUDA it leaves no choice of which product to fuse: a kernel that draws
-    and one that goes back must find the same splats. Pixels below each other have one square of e0.
+    and one that goes back must find the same splats. Pixels below each other share what e0 takes.
     """
     ...
 
 
 @wp.func
 def log_alpha_of(center: wp.vec4, e: wp.vec2) -> float:
-    """Logarithm of opacity times response."""
+    """Logarithm to the base 2 of opacity times response."""
     return log_of_response(center[2], e)
 
 
@@ -194,7 +191,7 @@ def sight_of(center: wp.vec4, shape: wp.vec4, position: wp.vec2) -> Sight:
 @wp.func
 def alpha_of(log_alpha: float) -> float:
     """Alpha of a splat that passes the cut."""
-    return wp.min(quick_exp(log_alpha), ALPHA_MAX)
+    return wp.min(quick_exp2(log_alpha), ALPHA_MAX)
 
 
 @wp.func_native("""

@@ -38,7 +38,7 @@ def test_no_pixel_that_counts_is_passed_over(rng):
     )
     firsts = np.floor(rng.uniform(0.0, 1000.0, (COUNT, 2))) + 0.5
     places = firsts - sideways.T + rng.uniform(0.0, PART - 1.0, (COUNT, 2))
-    centers = np.c_[places, np.log(rng.uniform(1.01 / 255.0, 1.0, COUNT)), np.ones(COUNT)]
+    centers = np.c_[places, np.log2(rng.uniform(1.01 / 255.0, 1.0, COUNT)), np.ones(COUNT)]
     given = ((centers, wp.vec4), (shapes, wp.vec4), (firsts, wp.vec2))
     arrays = [wp.array(rows.astype(np.float32), dtype=dtype, device="cpu") for rows, dtype in given]
     out = wp.zeros(COUNT, dtype=wp.vec2i, device="cpu")

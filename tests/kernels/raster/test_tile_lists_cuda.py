@@ -130,7 +130,7 @@ def test_every_pair_that_is_counted_is_emitted(rng):
         gaussians = (wp.array(positions, dtype=wp.vec3, device=device), *shapes_of)
         launch_project_entries(gaussians, views, projection, band, splats, order.counts, tallies, device)
         centers, shapes = (rows.numpy().astype(np.float64) for rows in (splats.centers, splats.shapes))
-        squared = 2.0 * (LOG_CUT + centers[:, 2])
+        squared = LOG_CUT + centers[:, 2]
         top = (np.floor(centers[:, 1] / SIDE) + row_of) * SIDE + 0.5 - centers[:, 1]
         left = centers[:, 0] + _left_end(shapes, squared, top, top + SIDE - 1.0)
         begin = np.where(is_above, centers[:, 1] - _reach_of_rows(shapes, squared), left)
