@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 import warp as wp
@@ -48,6 +49,8 @@ class FrameBuffers:
         images: The same images for callers.
         checkpoints: What pixels have come to on their way through long lists, on CUDA; empty unless asked for.
         passed: Sums of channels at checkpoints, a pass each.
+        summing: The stream on which counts of pairs are summed up while tiles are planned; None without CUDA.
+        gathering: The stream on which channels are gathered meanwhile; None without CUDA.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class FrameBuffers:
         self.channels = channels
         self.device = device
         self.exact = options.depth == "exact"
+        self.summing, self.gathering = (wp.Stream(device) if device.is_cuda else None for _ in range(2))
         tile_count = int(self.layout.first_tiles[-1])
         self._has_checkpoints = checkpoints and device.is_cuda and tile_count <= BLOCKS_HELD * device.sm_count
         if images_of is not None:
@@ -135,6 +139,15 @@ class FrameBuffers:
         if length not in self._pair_rows:
             self._pair_rows[length] = Rows.zeros(self.pair_capacity, length, self.device)
         return self._pair_rows[length]
+
+    def beside(self, stream: wp.Stream | None) -> AbstractContextManager[object]:
+        """Launch on another stream what needs nothing of the launches that follow it until `wait_for`."""
+        return nullcontext() if stream is None else wp.ScopedStream(stream)
+
+    def wait_for(self, stream: wp.Stream | None) -> None:
+        """Let what is launched from here on wait for what was launched `beside`."""
+        if stream is not None:
+            wp.get_stream(self.device).wait_stream(stream)
 
     def begin_sums(self) -> None:
         """Forget which pairs' rows were written, where that is noted: on CUDA."""

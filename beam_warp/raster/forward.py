@@ -67,9 +67,10 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
 
 
 def gather_channels(buffers: FrameBuffers) -> None:
-    """Write every splat's row of channels; where there are none, rows stay 0."""
-    for i, rows in enumerate(buffers.rows if buffers.channels.count else ()):
-        launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.matrix, buffers.device)
+    """Write every splat's row of channels; where there are none, rows stay 0. Compositing waits for it."""
+    with buffers.beside(buffers.gathering):
+        for i, rows in enumerate(buffers.rows if buffers.channels.count else ()):
+            launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.matrix, buffers.device)
 
 
 def plan_bands(buffers: FrameBuffers) -> list[tuple[int, int]]:
@@ -124,15 +125,17 @@ def _begin_band(buffers: FrameBuffers, tiles: tuple[int, int]) -> Band:
 
 
 def _sum_counts(buffers: FrameBuffers) -> None:
-    """Find where the pairs of every splat end."""
+    """Find where the pairs of every splat end; who asks for it waits."""
     if buffers.splat_count:
-        wp.utils.array_scan(buffers.order.counts, buffers.order.ends, inclusive=True)
+        with buffers.beside(buffers.summing):
+            wp.utils.array_scan(buffers.order.counts, buffers.order.ends, inclusive=True)
 
 
 def counted_pairs(buffers: FrameBuffers) -> int:
     """Return how many pairs the band that was counted last has; waits for the device."""
     if not buffers.splat_count:
         return 0
+    buffers.wait_for(buffers.summing)
     if buffers.splat_count * int(buffers.layout.first_tiles[-1]) < 2**31:
         return int(buffers.order.ends[-1:].numpy()[0])
     return int(buffers.order.counts.numpy().sum(dtype=np.int64))  # the ends may be beyond the range of integers
@@ -146,6 +149,7 @@ def list_pairs(buffers: FrameBuffers) -> None:
     inputs = (buffers.order, buffers.splats, buffers.views, buffers.gaussian_count, band)
     if buffers.device.is_cuda:
         launch_plan_tiles(buffers.tallies, tile_count, buffers.pair_capacity, frame.lists, buffers.device)
+        buffers.wait_for(buffers.summing)
         launch_emit_entries(*inputs, buffers.tallies, frame.lists, buffers.device)
         return
     frame.lists.ranges.zero_()

@@ -171,6 +171,7 @@ class Rasterizer:
             forward.project(self._buffers, gaussians)
             forward.gather_channels(self._buffers)
             self._bands = forward.plan_bands(self._buffers)
+            self._buffers.wait_for(self._buffers.gathering)
             for band in self._bands:
                 if len(self._bands) > 1:
                     forward.count_pairs(self._buffers, band)
@@ -188,8 +189,16 @@ class Rasterizer:
         Raises:
             InvalidOptionError: Nothing was drawn.
         """
-        self.relist()
-        return self.redraw_values()
+        gaussians = self._drawn_gaussians("redraw")
+        if not self.is_whole:
+            return self.draw(gaussians)
+        with wp.ScopedDevice(self.device):
+            forward.project(self._buffers, gaussians)
+            forward.gather_channels(self._buffers)
+            forward.list_pairs(self._buffers)
+            self._buffers.wait_for(self._buffers.gathering)
+            self._composite()
+        return self.images
 
     def relist(self) -> None:
         """Find the splats of every tile again, without waiting: the part of `redraw` that looks at no values.
@@ -218,6 +227,7 @@ class Rasterizer:
             return self.draw(gaussians)
         with wp.ScopedDevice(self.device):
             forward.gather_channels(self._buffers)
+            self._buffers.wait_for(self._buffers.gathering)
             self._composite()
         return self.images
 

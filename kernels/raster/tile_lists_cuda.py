@@ -26,7 +26,7 @@ SPREAD = wp.constant(8)
 """Numbers of a tile's tally: atomics on one sector of 32 bytes wait for each other. The first is that of its pairs."""
 
 EMITTED = wp.constant(4)
-"""Place in a tally of the number of pairs that were emitted."""
+"""Place in a tally of where the tile's next entry goes."""
 
 AHEAD = 4
 """Tiles of a row whose pairs are emitted together."""
@@ -112,19 +112,17 @@ def project_entries_kernel(
     .replace("EMITTED", str(EMITTED))
 )
 def take_places(tallies: wp.array[int], tile: int, count: int) -> Places:
-    """Places of an entry in the lists of ``count`` tiles side by side, at most `AHEAD`."""
+    """Places among all entries for one of each of ``count`` tiles side by side, at most `AHEAD`."""
     ...
 
 
 @wp.func
-def write_entry(lists: TileLists, tile: int, place: int, depth: wp.uint64, splat: int, slot: int, end: int):
+def write_entry(lists: TileLists, at: int, depth: wp.uint64, splat: int, slot: int, end: int):
     """Write the pair of a tile and a splat, and who owns its slot; ``end`` is that of the splat's slots."""
-    room = lists.ranges[tile]
-    at = room[0] + place
     has_slot = slot >= 0 and slot < end
     if has_slot:
         lists.owners[slot] = splat
-    if at < room[1]:
+    if at < lists.entries.shape[0]:
         lists.entries[at] = wp.where(has_slot, depth | wp.uint64(slot), NO_SLOT | wp.uint64(at))
 
 
@@ -167,9 +165,9 @@ def emit_entries_kernel(
             for k in range(AHEAD):
                 at = column + k
                 if at < counts[0]:
-                    write_entry(out_lists, upper_tile + at, upper_places[k], depth, splat, slot + at, end)
+                    write_entry(out_lists, upper_places[k], depth, splat, slot + at, end)
                 if at < counts[1]:
-                    write_entry(out_lists, lower_tile + at, lower_places[k], depth, splat, slot + counts[0] + at, end)
+                    write_entry(out_lists, lower_places[k], depth, splat, slot + counts[0] + at, end)
         slot += counts[0] + counts[1]
 
 
@@ -224,7 +222,9 @@ def emit_entries_kernel(
         const Sum start = own_before & (((Sum)1 << 40) - 1);
         if (i < end) {
             const bool fits = start + length <= capacity;
-            ranges.data[i] = wp::vec2i(fits ? (int)start : capacity, fits ? (int)start + length : capacity);
+            const int begin = fits ? (int)start : capacity;
+            ranges.data[i] = wp::vec2i(begin, fits ? begin + length : capacity);
+            tallies.data[i * SPREAD + EMITTED] = begin;
             const int empty = (int)(own_before >> 40);
             order.data[length > 0 ? atomicAdd(places + CLASS(length), 1) : tile_count - 1 - empty] = i;
         }
@@ -233,13 +233,14 @@ def emit_entries_kernel(
     #undef WEIGHT
     #undef CLASS
 #endif
-""".replace("SPREAD", str(SPREAD))
+""".replace("SPREAD", str(SPREAD)).replace("EMITTED", str(EMITTED))
 )
 def plan_tiles(
     tallies: wp.array[int], tile_count: int, capacity: int, ranges: wp.array[wp.vec2i], order: wp.array[int]
 ):
     """Places of the tiles' lists, one after the other, and the order in which tiles are drawn; by one block.
 
+    Tallies are told where entries begin, too.
     What begins last should not take longest: long lists lie where a surface is seen edge on. Tiles whose lists do not
     fit have none.
     """
