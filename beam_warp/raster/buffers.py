@@ -20,8 +20,9 @@ from beam_warp.raster.records import RasterImages, RasterOptions
 from beam_warp.world.camera import Camera
 
 BLOCKS_HELD = 16
-"""Blocks of the way back that a multiprocessor holds at most. Where there are more tiles than all of them hold, lists
-stay whole: no part of the GPU waits for the longest, and each part of a list costs a little."""
+"""Blocks of the way back that a multiprocessor holds at most. Where there are more tiles than all of them hold, no part
+of the GPU waits for the longest list. Then lists stay whole, for each part of one costs a little, and a lane draws two
+pixels."""
 
 
 class FrameBuffers:
@@ -49,6 +50,7 @@ class FrameBuffers:
         images: The same images for callers.
         checkpoints: What pixels have come to on their way through long lists, on CUDA; empty unless asked for.
         passed: Sums of channels at checkpoints, a pass each.
+        has_few_tiles: Whether the longest lists say how long a frame takes on CUDA.
         summing: The stream on which counts of pairs are summed up while tiles are planned; None without CUDA.
         gathering: The stream on which channels are gathered meanwhile; None without CUDA.
     """
@@ -77,7 +79,8 @@ class FrameBuffers:
         self.exact = options.depth == "exact"
         self.summing, self.gathering = (wp.Stream(device) if device.is_cuda else None for _ in range(2))
         tile_count = int(self.layout.first_tiles[-1])
-        self._has_checkpoints = checkpoints and device.is_cuda and tile_count <= BLOCKS_HELD * device.sm_count
+        self.has_few_tiles = device.is_cuda and tile_count <= BLOCKS_HELD * device.sm_count
+        self._has_checkpoints = checkpoints and self.has_few_tiles
         if images_of is not None:
             self._require_room(images_of)
         with wp.ScopedDevice(device):

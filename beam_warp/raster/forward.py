@@ -42,12 +42,14 @@ SPARE_CAPACITY = 1.25
 
 
 def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
-    """Make splats of the Gaussians; on CUDA count the pairs of all tiles, elsewhere order the splats in depth."""
+    """Make splats of the Gaussians; on CUDA count the pairs of all tiles, elsewhere order the splats in depth.
+
+    The tallies of tiles must be 0, as `list_pairs` leaves them.
+    """
     is_cuda, tiles = buffers.device.is_cuda, (0, int(buffers.layout.first_tiles[-1]))
     inputs = (gaussians[:4], buffers.views, buffers.projection)
     if is_cuda:
         counted = buffers.order.counts, buffers.tallies
-        buffers.tallies.zero_()
         launch_project_entries(*inputs, _begin_band(buffers, tiles), buffers.splats, *counted, buffers.device)
         _sum_counts(buffers)
     else:
@@ -168,6 +170,7 @@ def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) ->
         frame, drawn = (buffers.frame, rows.vectors, buffers.exact), (image.vectors, buffers.drawn)
         if draw is None and buffers.device.is_cuda:
             notes, colored = (buffers.checkpoints, passed.vectors), buffers.channels.count > 0
-            launch_composite_cuda(*frame, colored, *drawn, *notes, buffers.device)
+            pixels = 1 if buffers.has_few_tiles else 2
+            launch_composite_cuda(*frame, colored, pixels, *drawn, *notes, buffers.device)
         else:
             (draw or launch_composite_cpu)(*frame, *drawn, buffers.device)

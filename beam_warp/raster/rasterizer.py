@@ -168,6 +168,7 @@ class Rasterizer:
         require_gaussians(gaussians, self._count, self._buffers.channels, self.device)
         self._gaussians = None  # until all of it is drawn: a frame that is refused cannot be drawn again
         with wp.ScopedDevice(self.device):
+            self._buffers.tallies.zero_()
             forward.project(self._buffers, gaussians)
             forward.gather_channels(self._buffers)
             self._bands = forward.plan_bands(self._buffers)

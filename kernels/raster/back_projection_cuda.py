@@ -53,7 +53,8 @@ def back_project_cuda_kernel(channel_count: int):
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
         corner = (part / 2) * PART * SIDE + (part % 2) * PART
-        box = pixel_place(view, tile, corner)
+        first_center = pixel_place(view, tile, corner).position
+        last_center = first_center + wp.vec2(float(PART - 1), float(PART - 1))
         own = corner + (lane / PART) * SIDE + lane % PART
         upper = pixel_place(view, tile, own)
         lower = pixel_place(view, tile, own + SIDE * PART / 2)
@@ -91,7 +92,10 @@ def back_project_cuda_kernel(channel_count: int):
             wanted = int(0)
             if mine < own_end:
                 wanted = reaches(
-                    share_row(0, CENTER, lane, wp.vec4()), share_row(0, SHAPE, lane, wp.vec4()), box.position
+                    share_row(0, CENTER, lane, wp.vec4()),
+                    share_row(0, SHAPE, lane, wp.vec4()),
+                    first_center,
+                    last_center,
                 )
             waiting = ballot(wanted)
             while waiting != 0:

@@ -174,7 +174,8 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
         corner = (part / 2) * PART * SIDE + (part % 2) * PART
-        box = pixel_place(view, tile, corner)
+        first_center = pixel_place(view, tile, corner).position
+        last_center = first_center + wp.vec2(float(PART - 1), float(PART - 1))
         own = corner + (lane / PART) * SIDE + lane % PART
         upper = own_pixel(pixel_place(view, tile, own), images, adjoints)
         lower = own_pixel(pixel_place(view, tile, own + SIDE * PART / 2), images, adjoints)
@@ -207,7 +208,9 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
             wait_for_block()
             wanted = int(0)
             if splat >= 0 and mine < own_end:
-                wanted = reaches(shared_row(CENTER, lane, channels), shared_row(SHAPE, lane, channels), box.position)
+                wanted = reaches(
+                    shared_row(CENTER, lane, channels), shared_row(SHAPE, lane, channels), first_center, last_center
+                )
             waiting = ballot(wanted)
             while waiting != 0:
                 i = lowest_lane(waiting)

@@ -1,10 +1,13 @@
-"""Compositing on CUDA: a tile a block, 8 x 8 pixels a warp, two a lane.
+"""Compositing on CUDA: a tile a block, 8 x 8 pixels a warp, two a lane, one below the other.
 
 The block sorts its tile's list, as far as its pixels look. Then each warp goes through what was sorted by itself: its
 lanes look at 32 splats at once, those that reach its pixels are brought to shared memory, and it composites them, one
-after the other. What a splat costs to read is shared by two pixels of a lane. The block is done when all its pixels
-are. Where checkpoints are asked for, a warp notes what its pixels have come to before each `STRIDE` splats but the
-first.
+after the other. Two pixels of a lane share what a splat costs to read, and what depends on their column alone. The
+block is done when all its pixels are. Where checkpoints are asked for, a warp notes what its pixels have come to before
+each `STRIDE` splats but the first.
+
+A small image has too few tiles to keep a GPU busy, and the longest list says how long it takes. Its warps have 8 x 4
+pixels, one a lane: twice as many warps, of which each has fewer splats to go through. The bits are the same.
 """
 
 from functools import cache
@@ -25,7 +28,7 @@ from beam_warp.kernels.common.lanes import (
 )
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
-from beam_warp.kernels.raster.bin_tiles import SIDE, TileLists
+from beam_warp.kernels.raster.bin_tiles import SIDE, TILE, TileLists
 from beam_warp.kernels.raster.composite import Checkpoints, Images, PixelPlace, RasterFrame, channel_vector, pixel_place
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
@@ -43,20 +46,17 @@ from beam_warp.kernels.raster.splat_rows import (
     squared_extent,
     whiten,
 )
-from beam_warp.kernels.raster.tile_lists_cuda import THREADS, sort_entries
+from beam_warp.kernels.raster.tile_lists_cuda import sort_entries_function
 
 LANES = wp.constant(32)
 PART = wp.constant(8)
-"""Side of the pixels of a warp."""
-
-APART = wp.constant(PART // 2)
-"""Rows from a lane's upper pixel to its lower one."""
+"""Width of the pixels of a warp; with two a lane their height, too."""
 
 STRIDE = wp.constant(256)
 """Entries of a list between two checkpoints, a multiple of a warp's lanes."""
 
-BLOCKS = 6
-"""Blocks that a multiprocessor should hold at least: they limit registers."""
+THREADS_HELD = 768
+"""Threads that a multiprocessor should hold at least: they limit registers."""
 
 NOWHERE = wp.constant(wp.vec4(0.0, 0.0, -1.0e30, 0.0))
 """Centre of what reaches no pixel."""
@@ -65,16 +65,16 @@ CENTER, SHAPE, SLOPE, BEND = (wp.constant(k) for k in range(4))
 
 
 @wp.func
-def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2) -> int:
-    """1 if a splat reaches the pixels of a warp, ``first`` being the centre of the first one.
+def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, last: wp.vec2) -> int:
+    """1 if a splat reaches pixels, ``first`` and ``last`` being the centres of those at the corners of their box.
 
     Where their box, a little enlarged, does not hold the splat's centre, its least squared distance in standard
     deviations is on one of the two sides that face the centre. No root and no exact quotient is needed.
     """
     x0 = first[0] - center[0]
     y0 = first[1] - center[1]
-    x1 = x0 + float(PART - 1)
-    y1 = y0 + float(PART - 1)
+    x1 = last[0] - center[0]
+    y1 = last[1] - center[1]
     farthest = wp.max(wp.max(-x0, x1), wp.max(-y0, y1))
     margin = RELATIVE_MARGIN * farthest + EXTENT_MARGIN
     x0 -= margin
@@ -114,9 +114,28 @@ def begin_pixel(place: PixelPlace) -> PixelSums:
 
 
 @wp.func
-def looks(upper: PixelSums, lower: PixelSums) -> int:
-    """1 if one of two pixels still looks further."""
-    return wp.where(wp.max(upper.transmittance, lower.transmittance) >= TRANSMITTANCE_STOP, 1, 0)
+def looks(sums: PixelSums) -> int:
+    """1 if a pixel still looks further."""
+    return wp.where(sums.transmittance >= TRANSMITTANCE_STOP, 1, 0)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned long long rows = static_cast<unsigned>(upper) | static_cast<unsigned long long>(lower) << 32;
+    unsigned columns = static_cast<unsigned>(upper) | static_cast<unsigned>(lower);
+    columns |= columns >> 16;
+    columns = (columns | columns >> 8) & 255u;
+    return wp::vec4(__ffs(columns) - 1, (__ffsll(rows) - 1) >> 3, 31 - __clz(columns), (63 - __clzll(rows)) >> 3);
+#else
+    return wp::vec4();
+#endif
+""")
+def box_of(upper: int, lower: int) -> wp.vec4:
+    """First column, first row, last column and last row of a warp's pixels whose bits are set, not all of them 0.
+
+    Bits are those of lanes, eight a row; those of ``lower`` are of rows below those of ``upper``.
+    """
+    ...
 
 
 @wp.func
@@ -170,16 +189,22 @@ def splat_row(rows: wp.array[wp.vec4], splat: int, otherwise: wp.vec4) -> wp.vec
 
 
 @cache
-def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True):
-    """Return the kernel that composites ``channel_count`` channels, two pixels an item; unless ``colored``, none.
+def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True, pixels: int = 2):
+    """Return the kernel that composites ``channel_count`` channels, or none, for ``pixels`` an item, one or two.
 
-    Shadow maps show depth alone. Channels then stay what they were: 0.
+    Shadow maps show depth alone, uncoloured. Channels then stay what they were: 0.
     """
     Channels = channel_vector(channel_count)
     nearness_at = nearness_function(exact)
-    share, shared_row = share_splats_functions(Channels, 4 if exact else 3, THREADS)
+    threads = TILE * TILE // pixels
+    share, shared_row = share_splats_functions(Channels, 4 if exact else 3, threads)
+    sort_entries = sort_entries_function(threads)
+    rows = LANES // PART
+    both = pixels == 2
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=(THREADS, BLOCKS), grid_stride=False)
+    @wp.kernel(
+        enable_backward=False, module="unique", launch_bounds=(threads, THREADS_HELD // threads), grid_stride=False
+    )
     def composite_blocks_kernel(
         first: int,
         frame: RasterFrame,
@@ -191,15 +216,18 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
     ):
         item = first + wp.tid()
         lane = item % LANES
-        part = item % THREADS / LANES
-        listed = frame.lists.order[item / THREADS]
+        part = item % threads / LANES
+        listed = frame.lists.order[item / threads]
         tile = frame.band.first_tile + listed
         view = frame.views[frame.tile_views[tile]]
-        corner = part / 2 * PART * SIDE + part % 2 * PART
-        box = pixel_place(view, tile, corner).position
+        corner = part / 2 * wp.static(rows * pixels) * SIDE + part % 2 * PART
+        origin = pixel_place(view, tile, corner).position
         within = corner + lane / PART * SIDE + lane % PART
         upper_place = pixel_place(view, tile, within)
-        lower_place = pixel_place(view, tile, within + APART * SIDE)
+        lower_place = PixelPlace()
+        lower_place.index = -1
+        if wp.static(both):
+            lower_place = pixel_place(view, tile, within + wp.static(rows) * SIDE)
         upper = begin_pixel(upper_place)
         lower = begin_pixel(lower_place)
         upper_total = Channels()
@@ -217,6 +245,13 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                 frame.lists.splats,
                 frame.lists.slots,
             )
+            upper_looks = ballot(looks(upper))
+            lower_looks = int(0)
+            if wp.static(both):
+                lower_looks = ballot(looks(lower))
+            box = box_of(upper_looks, lower_looks)
+            first_center = wp.vec2(origin[0] + box[0], origin[1] + box[1])
+            last_center = wp.vec2(origin[0] + box[2], origin[1] + box[3])
             # Groups begin at multiples of lanes, so that strides do, too, wherever what was sorted ended.
             end = wp.min(begin + LANES - (begin - listed_range[0]) % LANES, sorted_end)
             splat = listed_splat(frame.lists, begin + lane, end)
@@ -224,7 +259,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
             shape = splat_row(frame.splats.shapes, splat, NOWHERE)
             ahead = listed_splat(frame.lists, end + lane, wp.min(end + LANES, sorted_end))
             while begin < sorted_end:
-                if ballot(looks(upper, lower)) == 0:
+                if ballot(wp.max(looks(upper), looks(lower))) == 0:
                     begin = sorted_end
                     continue
                 passed_by = begin - listed_range[0]
@@ -233,10 +268,11 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     out_checkpoints.tiles[begin / STRIDE] = listed + 1
                     out_checkpoints.states[row] = wp.vec4(upper.transmittance, upper.weight, upper.depth, 0.0)
                     out_passed[row] = upper_total
-                    row += APART * SIDE
-                    out_checkpoints.states[row] = wp.vec4(lower.transmittance, lower.weight, lower.depth, 0.0)
-                    out_passed[row] = lower_total
-                wanted = reaches(center, shape, box)
+                    if wp.static(both):
+                        row += wp.static(rows) * SIDE
+                        out_checkpoints.states[row] = wp.vec4(lower.transmittance, lower.weight, lower.depth, 0.0)
+                        out_passed[row] = lower_total
+                wanted = reaches(center, shape, first_center, last_center)
                 waiting = ballot(wanted)
                 wait_for_warp()  # until all its lanes are done with the group before
                 i = part * LANES
@@ -271,12 +307,15 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     drawn = shared_row(CENTER, k, channels)
                     drawn_shape = shared_row(SHAPE, k, channels)
                     above = offset_from(drawn, upper_place.position)
-                    below = wp.vec2(above[0], lower_place.position[1] - drawn[1])
                     log_above = log_alpha_of(drawn, whiten(drawn_shape, above))
-                    log_below = log_alpha_of(drawn, whiten(drawn_shape, below))
                     in_upper = upper.transmittance >= TRANSMITTANCE_STOP and log_above >= -LOG_CUT
-                    in_lower = lower.transmittance >= TRANSMITTANCE_STOP and log_below >= -LOG_CUT
-                    if ballot(wp.where(in_upper or in_lower, 1, 0)) == 0:
+                    seen = in_upper
+                    if wp.static(both):
+                        below = wp.vec2(above[0], lower_place.position[1] - drawn[1])
+                        log_below = log_alpha_of(drawn, whiten(drawn_shape, below))
+                        in_lower = lower.transmittance >= TRANSMITTANCE_STOP and log_below >= -LOG_CUT
+                        seen = in_upper or in_lower
+                    if ballot(wp.where(seen, 1, 0)) == 0:
                         continue
                     # No branches from here on: each would cost a selection for every variable that it changes.
                     at = wp.cast(drawn_shape[3], int)
@@ -285,22 +324,27 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
                     if wp.static(exact):
                         bounds = shared_row(BEND, k, channels)
                     limits = wp.vec2(bounds[2], bounds[3])
-                    upper_z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], above))
-                    lower_z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], below))
-                    upper_alpha = wp.where(in_upper, alpha_of(log_above), 0.0)
-                    lower_alpha = wp.where(in_lower, alpha_of(log_below), 0.0)
-                    upper_weight = upper_alpha * upper.transmittance
-                    lower_weight = lower_alpha * lower.transmittance
+                    row_of = Channels()
                     if wp.static(colored):
                         row_of = share(CHANNELS, 0, k, wp.vec4(), channels, 0)
+                    upper_z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], above))
+                    upper_alpha = wp.where(in_upper, alpha_of(log_above), 0.0)
+                    upper_weight = upper_alpha * upper.transmittance
+                    if wp.static(colored):
                         upper_total += row_of * upper_weight
-                        lower_total += row_of * lower_weight
                     upper = add_splat(upper, in_upper, upper_alpha, upper_weight, upper_z, at)
-                    lower = add_splat(lower, in_lower, lower_alpha, lower_weight, lower_z, at)
-            if any_of_block(looks(upper, lower)) == 0:
+                    if wp.static(both):
+                        lower_z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], below))
+                        lower_alpha = wp.where(in_lower, alpha_of(log_below), 0.0)
+                        lower_weight = lower_alpha * lower.transmittance
+                        if wp.static(colored):
+                            lower_total += row_of * lower_weight
+                        lower = add_splat(lower, in_lower, lower_alpha, lower_weight, lower_z, at)
+            if any_of_block(wp.max(looks(upper), looks(lower))) == 0:
                 begin = listed_range[1]
         end_pixel(upper_place, upper, frame, listed_range[0], out_images)
-        end_pixel(lower_place, lower, frame, listed_range[0], out_images)
+        if wp.static(both):
+            end_pixel(lower_place, lower, frame, listed_range[0], out_images)
         if wp.static(colored):
             if upper_place.index >= 0:
                 out_channels[upper_place.index] = upper_total
@@ -311,14 +355,15 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True)
 
 
 def launch_composite_cuda(
-    frame, channels, exact, colored, out_channels, out_images, out_checkpoints, out_passed, device
+    frame, channels, exact, colored, pixels, out_channels, out_images, out_checkpoints, out_passed, device
 ):
-    """Composite a band on a CUDA device; checkpoints get their sums of channels in ``out_passed``."""
+    """Composite a band on a CUDA device, one pixel or two a lane; checkpoints' sums of channels are ``out_passed``."""
+    threads = TILE * TILE // pixels
     launch(
-        composite_cuda_kernel(channels.dtype._length_, exact, colored),
-        (frame.band.end_tile - frame.band.first_tile) * THREADS,
+        composite_cuda_kernel(channels.dtype._length_, exact, colored, pixels),
+        (frame.band.end_tile - frame.band.first_tile) * threads,
         inputs=[frame, channels],
         outputs=[out_channels, out_images, out_checkpoints, out_passed],
         device=device,
-        block_dim=THREADS,
+        block_dim=threads,
     )

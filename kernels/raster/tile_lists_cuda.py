@@ -7,6 +7,8 @@ many more as its pixels look at: where the front hides the rest, most of a long 
 Entries are emitted by atomics, in any order; once they are sorted nothing of it is left.
 """
 
+from functools import cache
+
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
@@ -34,10 +36,7 @@ AHEAD = 4
 Places = wp.types.vector(length=AHEAD, dtype=int)
 
 FEW = 128
-"""Most entries of a list that are compared with each other, at most `THREADS`."""
-
-THREADS = wp.constant(128)
-"""Threads of the blocks that sort, a power of two; each counts four bins of depth."""
+"""Most entries of a list that are compared with each other: a thread each."""
 
 PLANNERS = 1024
 """Threads of the block that plans."""
@@ -77,7 +76,7 @@ def count_entries_kernel(
     out_counts[splat] = count_entries(splat, splats, views[splat / gaussian_count], band, out_tallies)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 4))
 def project_entries_kernel(
     first: int,
     positions: wp.array[wp.vec3],
@@ -188,11 +187,18 @@ def emit_entries_kernel(
         places[thread] = 0;
     __syncthreads();
     Sum own = 0;
-    for (int i = first + lane; i < end; i += 32) {
-        const int length = tallies.data[i * SPREAD];
-        own += WEIGHT(length);
-        if (length > 0)
-            atomicAdd(places + CLASS(length), 1);
+    for (int base = first + lane; base < end; base += 8 * 32) {
+        int lengths[8];  // loaded together: a warp does not wait for one after the other
+        #pragma unroll
+        for (int k = 0; k < 8; ++k)
+            lengths[k] = tallies.data[min(base + 32 * k, end - 1) * SPREAD];
+        #pragma unroll
+        for (int k = 0; k < 8; ++k)
+            if (base + 32 * k < end) {
+                own += WEIGHT(lengths[k]);
+                if (lengths[k] > 0)
+                    atomicAdd(places + CLASS(lengths[k]), 1);
+            }
     }
     for (int step = 16; step > 0; step /= 2)
         own += __shfl_xor_sync(0xffffffffu, own, step);
@@ -212,7 +218,11 @@ def emit_entries_kernel(
     __syncthreads();
     for (int base = first; base < end; base += 32) {
         const int i = base + lane;
-        const int length = i < end ? tallies.data[i * SPREAD] : 0;
+        int length = 0;
+        if (i < end) {
+            length = tallies.data[i * SPREAD];
+            tallies.data[i * SPREAD] = 0;
+        }
         Sum sum = WEIGHT(length);
         for (int step = 1; step < 32; step *= 2) {
             const Sum other = __shfl_up_sync(0xffffffffu, sum, step);
@@ -240,7 +250,7 @@ def plan_tiles(
 ):
     """Places of the tiles' lists, one after the other, and the order in which tiles are drawn; by one block.
 
-    Tallies are told where entries begin, too.
+    Tallies are told where entries begin, and their counts go back to 0.
     What begins last should not take longest: long lists lie where a surface is seen edge on. Tiles whose lists do not
     fit have none.
     """
@@ -420,26 +430,31 @@ _SORT_ENTRIES = """
 """
 
 
-_SORT_ENTRIES = _SORT_ENTRIES.replace("THREADS", str(THREADS)).replace("BITS", str(THREADS.bit_length() - 1))
+@cache
+def sort_entries_function(threads: int):
+    """Return the function with which a block of so many threads, a power of two, sorts a tile's list part by part."""
+    snippet = _SORT_ENTRIES.replace("THREADS", str(threads)).replace("BITS", str(threads.bit_length() - 1))
 
+    @wp.func_native(snippet.replace("SORTED", str(SORTED)).replace("FEW", str(FEW)))
+    def sort_entries(
+        entries: wp.array[wp.uint64],
+        owners: wp.array[int],
+        begin: int,
+        listed: int,
+        end: int,
+        parted: wp.array[wp.uint64],
+        splats: wp.array[int],
+        slots: wp.array[int],
+    ) -> int:
+        """List the next entries of a tile in order, at most `SORTED`, after those ``listed``; return the new end.
 
-@wp.func_native(_SORT_ENTRIES.replace("SORTED", str(SORTED)).replace("FEW", str(FEW)))
-def sort_entries(
-    entries: wp.array[wp.uint64],
-    owners: wp.array[int],
-    begin: int,
-    listed: int,
-    end: int,
-    parted: wp.array[wp.uint64],
-    splats: wp.array[int],
-    slots: wp.array[int],
-) -> int:
-    """List the next entries of a tile in order, at most `SORTED`, after those ``listed``; return the new end.
+        ``begin`` and ``end`` are the tile's range; a long list is parted by depth first, into ``parted``. Entries of a
+        part are counted in bins, four a thread, and those of a bin compared with each other. All threads of the block
+        call it together.
+        """
+        ...
 
-    ``begin`` and ``end`` are the tile's range; a long list is parted by depth first, into ``parted``. Entries of a part
-    are counted in bins, and those of a bin compared with each other. All threads of the block call it together.
-    """
-    ...
+    return sort_entries
 
 
 launch_count_entries = launcher(count_entries_kernel, in_order=True)

@@ -37,7 +37,7 @@ TRACING = {
 COMPOSITES = ((4, False), (16, True))
 
 RASTER = {
-    "raster.composite_cuda": ("composite_cuda_kernel", (*COMPOSITES, (4, False, False))),
+    "raster.composite_cuda": ("composite_cuda_kernel", (*COMPOSITES, (4, False, False), (16, True, True, 1))),
     "raster.composite_adjoint_cuda": ("composite_adjoint_cuda_kernel", COMPOSITES),
     "raster.back_projection_cuda": ("back_project_cuda_kernel", ((4,), (8,), (12,), (16,))),
 }

@@ -13,8 +13,8 @@ from beam_warp.raster.records import GaussianArrays, RasterOptions
 STABILITY = 10.0
 """Factor of the spread under one rounding of the inputs: a few dozen roundings in a chain, as their root sum."""
 
-EXPONENTIAL_ULPS = 2.0
-"""Error of `quick_exp2` on CUDA: 2^-22 (PTX ISA, ex2.approx.ftz)."""
+EXPONENTIAL_ROUNDINGS = 4.0
+"""Error of `quick_exp2` on CUDA: 2^-22 (PTX ISA, ex2.approx.ftz), in roundings of 2^-24."""
 
 
 class Drawn:

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from beam_warp.kernels.raster.composite_cuda import PART, reaches
-from beam_warp.kernels.raster.project import LOG_CUT
+from beam_warp.kernels.raster.project import LOG_CUT, WHITENING
 from beam_warp.kernels.raster.splat_rows import log_alpha_of, offset_from, whiten
 
 COUNT = 200_000
@@ -12,16 +12,22 @@ COUNT = 200_000
 
 @wp.kernel(enable_backward=False)
 def look_at_boxes_kernel(
-    centers: wp.array[wp.vec4], shapes: wp.array[wp.vec4], firsts: wp.array[wp.vec2], out_found: wp.array[wp.vec2i]
+    centers: wp.array[wp.vec4],
+    shapes: wp.array[wp.vec4],
+    firsts: wp.array[wp.vec2],
+    sides: wp.array[wp.vec2i],
+    out_found: wp.array[wp.vec2i],
 ):
     """How many pixels of a box a splat counts for, and whether it reaches the box."""
     i = wp.tid()
     counted = wp.int32(0)
-    for k in range(PART * PART):
-        pixel = firsts[i] + wp.vec2(float(k % PART), float(k / PART))
-        if log_alpha_of(centers[i], whiten(shapes[i], offset_from(centers[i], pixel))) >= -LOG_CUT:
-            counted += 1
-    out_found[i] = wp.vec2i(counted, reaches(centers[i], shapes[i], firsts[i]))
+    for y in range(sides[i][1]):
+        for x in range(sides[i][0]):
+            pixel = firsts[i] + wp.vec2(float(x), float(y))
+            if log_alpha_of(centers[i], whiten(shapes[i], offset_from(centers[i], pixel))) >= -LOG_CUT:
+                counted += 1
+    last = firsts[i] + wp.vec2(float(sides[i][0] - 1), float(sides[i][1] - 1))
+    out_found[i] = wp.vec2i(counted, reaches(centers[i], shapes[i], firsts[i], last))
 
 
 def test_no_pixel_that_counts_is_passed_over(rng):
@@ -31,16 +37,18 @@ def test_no_pixel_that_counts_is_passed_over(rng):
     angle, around = rng.uniform(0.0, 2.0 * np.pi, (2, COUNT))
     xx, yy = ((long * one) ** 2 + (thin * other) ** 2 + low_pass for one, other in _turns(angle))
     xy = (long**2 - thin**2) * np.sin(angle) * np.cos(angle)
-    shapes = np.stack([1.0 / np.sqrt(xx), xy / xx, np.sqrt(xx / (xx * yy - xy * xy)), long], axis=1)
+    whitening = float(WHITENING)
+    shapes = np.stack([whitening / np.sqrt(xx), xy / xx, whitening * np.sqrt(xx / (xx * yy - xy * xy)), long], axis=1)
     rim = 3.3 * rng.uniform(0.0, 1.15, COUNT) * np.stack([long * np.cos(around), thin * np.sin(around)])
     sideways = np.stack(
         [rim[0] * np.cos(angle) - rim[1] * np.sin(angle), rim[0] * np.sin(angle) + rim[1] * np.cos(angle)]
     )
     firsts = np.floor(rng.uniform(0.0, 1000.0, (COUNT, 2))) + 0.5
-    places = firsts - sideways.T + rng.uniform(0.0, PART - 1.0, (COUNT, 2))
+    sides = rng.integers(1, PART + 1, (COUNT, 2))
+    places = firsts - sideways.T + rng.uniform(0.0, sides - 1.0)
     centers = np.c_[places, np.log2(rng.uniform(1.01 / 255.0, 1.0, COUNT)), np.ones(COUNT)]
-    given = ((centers, wp.vec4), (shapes, wp.vec4), (firsts, wp.vec2))
-    arrays = [wp.array(rows.astype(np.float32), dtype=dtype, device="cpu") for rows, dtype in given]
+    given = ((centers, wp.vec4), (shapes, wp.vec4), (firsts, wp.vec2), (sides, wp.vec2i))
+    arrays = [wp.array(rows, dtype=dtype, device="cpu") for rows, dtype in given]
     out = wp.zeros(COUNT, dtype=wp.vec2i, device="cpu")
     wp.launch(look_at_boxes_kernel, COUNT, inputs=arrays, outputs=[out], device="cpu")
     counted, reached = out.numpy().T

@@ -1,5 +1,7 @@
 """Every tile's list has its room and its turn, and is sorted by depth and slot, piece by piece."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import warp as wp
@@ -11,11 +13,10 @@ from beam_warp.kernels.raster.tile_lists_cuda import (
     EMITTED,
     SORTED,
     SPREAD,
-    THREADS,
     launch_emit_entries,
     launch_plan_tiles,
     launch_project_entries,
-    sort_entries,
+    sort_entries_function,
 )
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.world.camera import Camera
@@ -26,30 +27,37 @@ ONE = 0x3F800000
 """Bits of a depth of 1."""
 
 
-@wp.kernel(enable_backward=False)
-def sort_all_kernel(
-    entries: wp.array[wp.uint64],
-    owners: wp.array[int],
-    begin: int,
-    end: int,
-    parted: wp.array[wp.uint64],
-    out_splats: wp.array[int],
-    out_slots: wp.array[int],
-    out_most: wp.array[int],
-):
-    """One block sorts a list to its end."""
-    thread = wp.tid()
-    listed = wp.int32(begin)
-    while listed < end:
-        further = sort_entries(entries, owners, begin, listed, end, parted, out_splats, out_slots)
-        if thread == 0:
-            wp.atomic_max(out_most, 0, further - listed)
-        listed = further
+@cache
+def sort_all_kernel(threads):
+    """Return the kernel whose only block, of so many threads, sorts a list to its end."""
+    sort_entries = sort_entries_function(threads)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def kernel(
+        entries: wp.array[wp.uint64],
+        owners: wp.array[int],
+        begin: int,
+        end: int,
+        parted: wp.array[wp.uint64],
+        out_splats: wp.array[int],
+        out_slots: wp.array[int],
+        out_most: wp.array[int],
+    ):
+        thread = wp.tid()
+        listed = wp.int32(begin)
+        while listed < end:
+            further = sort_entries(entries, owners, begin, listed, end, parted, out_splats, out_slots)
+            if thread == 0:
+                wp.atomic_max(out_most, 0, further - listed)
+            listed = further
+
+    return kernel
 
 
+@pytest.mark.parametrize("threads", [128, 256])
 @pytest.mark.parametrize("kind", ["even", "equal", "crowded", "without slots"])
 @pytest.mark.parametrize("count", [1, 31, 33, 256, SORTED, SORTED + 1, 5000, 70_000])
-def test_entries_are_sorted(rng, count, kind):
+def test_entries_are_sorted(rng, count, kind, threads):
     """Lists beyond what shared memory holds, too; equal depths by slot; entries without a slot last."""
     begin, capacity = 5, count + 8
     depths = ONE + rng.integers(0, 2**22, count)
@@ -69,7 +77,8 @@ def test_entries_are_sorted(rng, count, kind):
     found = [wp.full(capacity, -7, dtype=int, device="cuda:0") for _ in range(2)]
     most = wp.zeros(1, dtype=int, device="cuda:0")
     inputs = [given, wp.array(owners, dtype=int, device="cuda:0"), begin, begin + count, wp.zeros_like(given)]
-    wp.launch(sort_all_kernel, THREADS, inputs=inputs, outputs=[*found, most], device="cuda:0", block_dim=THREADS)
+    kernel, outputs = sort_all_kernel(threads), [*found, most]
+    wp.launch(kernel, threads, inputs=inputs, outputs=outputs, device="cuda:0", block_dim=threads)
     ordered = np.sort(entries)
     expected = np.where(ordered >= 2**63, -1, (ordered & np.uint64(0xFFFFFFFF)).astype(np.int64))
     splats, listed = (array.numpy()[begin : begin + count] for array in found)
@@ -141,11 +150,13 @@ def test_every_pair_that_is_counted_is_emitted(rng):
     pairs = int(order.ends.numpy()[-1])
     lists.ranges, lists.order = zeros(tile_count, wp.vec2i), zeros(tile_count)
     lists.owners, lists.entries = zeros(pairs), zeros(pairs, wp.uint64)
+    counted = tallies.numpy()[:: int(SPREAD)]
     launch_plan_tiles(tallies, tile_count, pairs, lists, device)
     launch_emit_entries(order, splats, views, count, band, tallies, lists, device)
-    counted, places = tallies.numpy().reshape(tile_count, -1)[:, [0, EMITTED]].T
+    left, places = tallies.numpy().reshape(tile_count, -1)[:, [0, EMITTED]].T
     assert pairs > 2 * count
     assert np.median(np.abs(shift)) < 1e-5
+    assert not left.any()
     np.testing.assert_array_equal(places, np.cumsum(counted))  # each list ends where the next one begins
     assert (lists.entries.numpy() != 0).all()
     np.testing.assert_array_equal(lists.owners.numpy(), np.repeat(np.arange(count), order.counts.numpy()))
