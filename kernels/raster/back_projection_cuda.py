@@ -24,7 +24,7 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_below, pixel_place
 from beam_warp.kernels.raster.composite_adjoint_cuda import PART, THREADS, WARPS
 from beam_warp.kernels.raster.composite_cuda import CENTER, LANES, SHAPE, reaches
 from beam_warp.kernels.raster.project import LOG_CUT
@@ -57,7 +57,7 @@ def back_project_cuda_kernel(channel_count: int):
         last_center = first_center + wp.vec2(float(PART - 1), float(PART - 1))
         own = corner + (lane / PART) * SIDE + lane % PART
         upper = pixel_place(view, tile, own)
-        lower = pixel_place(view, tile, own + SIDE * PART / 2)
+        lower = pixel_below(view, tile, own, PART / 2, upper)
         upper_end = int(-1)
         lower_end = int(-1)
         held_by_upper = Channels()

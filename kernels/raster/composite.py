@@ -75,6 +75,14 @@ def pixel_place(view: RasterView, tile: int, within: int) -> PixelPlace:
     return place
 
 
+@wp.func
+def pixel_below(view: RasterView, tile: int, within: int, rows: int, above: PixelPlace) -> PixelPlace:
+    """Place of the pixel some rows below another one: compilers see that x is the same, and find once what it gives."""
+    place = pixel_place(view, tile, within + rows * SIDE)
+    place.position = wp.vec2(above.position[0], place.position[1])
+    return place
+
+
 @cache
 def channel_vector(channel_count: int):
     """Return the Warp type of a row of channels."""

@@ -31,7 +31,15 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
-from beam_warp.kernels.raster.composite import Checkpoints, Images, PixelPlace, RasterFrame, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import (
+    Checkpoints,
+    Images,
+    PixelPlace,
+    RasterFrame,
+    channel_vector,
+    pixel_below,
+    pixel_place,
+)
 from beam_warp.kernels.raster.composite_adjoint import (
     Adjoints,
     PixelState,
@@ -177,8 +185,9 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
         first_center = pixel_place(view, tile, corner).position
         last_center = first_center + wp.vec2(float(PART - 1), float(PART - 1))
         own = corner + (lane / PART) * SIDE + lane % PART
-        upper = own_pixel(pixel_place(view, tile, own), images, adjoints)
-        lower = own_pixel(pixel_place(view, tile, own + SIDE * PART / 2), images, adjoints)
+        place = pixel_place(view, tile, own)
+        upper = own_pixel(place, images, adjoints)
+        lower = own_pixel(pixel_below(view, tile, own, PART / 2, place), images, adjoints)
         to_upper = Channels()
         to_lower = Channels()
         if upper.index >= 0:

@@ -29,7 +29,15 @@ from beam_warp.kernels.common.lanes import (
 from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE, TILE, TileLists
-from beam_warp.kernels.raster.composite import Checkpoints, Images, PixelPlace, RasterFrame, channel_vector, pixel_place
+from beam_warp.kernels.raster.composite import (
+    Checkpoints,
+    Images,
+    PixelPlace,
+    RasterFrame,
+    channel_vector,
+    pixel_below,
+    pixel_place,
+)
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import (
     EXTENT_MARGIN,
@@ -227,7 +235,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True,
         lower_place = PixelPlace()
         lower_place.index = -1
         if wp.static(both):
-            lower_place = pixel_place(view, tile, within + wp.static(rows) * SIDE)
+            lower_place = pixel_below(view, tile, within, wp.static(rows), upper_place)
         upper = begin_pixel(upper_place)
         lower = begin_pixel(lower_place)
         upper_total = Channels()
@@ -311,7 +319,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True,
                     in_upper = upper.transmittance >= TRANSMITTANCE_STOP and log_above >= -LOG_CUT
                     seen = in_upper
                     if wp.static(both):
-                        below = wp.vec2(above[0], lower_place.position[1] - drawn[1])
+                        below = offset_from(drawn, lower_place.position)
                         log_below = log_alpha_of(drawn, whiten(drawn_shape, below))
                         in_lower = lower.transmittance >= TRANSMITTANCE_STOP and log_below >= -LOG_CUT
                         seen = in_upper or in_lower
