@@ -39,7 +39,10 @@ FEW = 128
 """Most entries of a list that are compared with each other: a thread each."""
 
 PLANNERS = 1024
-"""Threads of the block that plans."""
+"""Threads of a block that plans."""
+
+MOST_PLANS = 32
+"""Most blocks that plan: each looks at all tiles."""
 
 NO_SLOT = wp.constant(wp.uint64(1 << 63))
 """The bit of entries of pairs that have no slot; they come last."""
@@ -136,8 +139,13 @@ def emit_entries_kernel(
     tallies: wp.array[int],
     out_lists: TileLists,
 ):
-    """Entries beyond a tile's room are left out; a pair without a slot, beyond the capacity, leaves a last entry."""
+    """Entries beyond a tile's room are left out; a pair without a slot, beyond the capacity, leaves a last entry.
+
+    The numbers of pairs in the tallies go back to 0, for the next frame.
+    """
     splat = first + wp.tid()
+    for tile in range(splat, band.end_tile - band.first_tile, order.counts.shape[0]):
+        tallies[tile * SPREAD] = 0
     count = order.counts[splat]
     if count <= 0:
         return
@@ -170,65 +178,65 @@ def emit_entries_kernel(
         slot += counts[0] + counts[1]
 
 
-@wp.func_native(
-    """
+_PLAN_TILES = """
 #if defined(__CUDA_ARCH__)
     // Classes of lengths, four an octave; those of longer lists are drawn first, empty ones last.
-    __shared__ int places[128];
-    __shared__ unsigned long long sums[32];  // of each warp
+    __shared__ int classes[128], places[128];
+    __shared__ unsigned long long sums[PLANNERS / 32];  // of each warp
     const int thread = threadIdx.x, lane = thread & 31, warp = thread >> 5;
-    // A warp has a run of tiles. Above the 40 bits of a sum of lengths is the number of empty tiles.
-    const int each = (tile_count + blockDim.x - 1) / blockDim.x * 32;
-    const int first = min(warp * each, tile_count), end = min(first + each, tile_count);
+    const int first = min(blockIdx.x * own_count, tile_count), end = min(first + own_count, tile_count);
+    // Above the 40 bits of a sum of lengths is the number of empty tiles.
     typedef unsigned long long Sum;
-    #define CLASS(n) min(127, (int)(__float_as_uint((float)(n)) >> 21) - 507)
-    #define WEIGHT(n) ((n) > 0 ? (Sum)(n) : (Sum)1 << 40)
+    const auto weight = [](int length) { return length > 0 ? (Sum)length : (Sum)1 << 40; };
+    const auto class_of = [](int length) { return min(127, (int)(__float_as_uint((float)length) >> 21) - 507); };
+    const auto sum_of_warps = [&](int count) {
+        Sum sum = 0;
+        for (int i = 0; i < count; ++i)
+            sum += sums[i];
+        return sum;
+    };
     if (thread < 128)
-        places[thread] = 0;
+        classes[thread] = places[thread] = 0;
     __syncthreads();
-    Sum own = 0;
-    for (int base = first + lane; base < end; base += 8 * 32) {
-        int lengths[8];  // loaded together: a warp does not wait for one after the other
+    // Every block looks at all tiles, which takes less time than to wait for each other.
+    Sum before = 0;
+    for (int base = thread; base < tile_count; base += 8 * PLANNERS) {
+        int lengths[8];  // loaded together: a thread does not wait for one after the other
         #pragma unroll
         for (int k = 0; k < 8; ++k)
-            lengths[k] = tallies.data[min(base + 32 * k, end - 1) * SPREAD];
+            lengths[k] = tallies.data[min(base + k * PLANNERS, tile_count - 1) * SPREAD];
         #pragma unroll
-        for (int k = 0; k < 8; ++k)
-            if (base + 32 * k < end) {
-                own += WEIGHT(lengths[k]);
-                if (lengths[k] > 0)
-                    atomicAdd(places + CLASS(lengths[k]), 1);
-            }
+        for (int k = 0; k < 8; ++k) {
+            const int i = base + k * PLANNERS;
+            if (i < tile_count && lengths[k] > 0)
+                atomicAdd(classes + class_of(lengths[k]), 1);
+            if (i < first && lengths[k] > 0)
+                atomicAdd(places + class_of(lengths[k]), 1);
+            before += i < first ? weight(lengths[k]) : 0;
+        }
     }
     for (int step = 16; step > 0; step /= 2)
-        own += __shfl_xor_sync(0xffffffffu, own, step);
+        before += __shfl_xor_sync(0xffffffffu, before, step);
     if (lane == 0)
-        sums[warp] = own;
+        sums[warp] = before;
     __syncthreads();
-    Sum before = 0;
-    for (int i = 0; i < warp; ++i)
-        before += sums[i];
-    int longer = 0;
+    before = sum_of_warps(PLANNERS / 32);
     if (thread < 128)
         for (int i = thread + 1; i < 128; ++i)
-            longer += places[i];
-    __syncthreads();
-    if (thread < 128)
-        places[thread] = longer;
-    __syncthreads();
-    for (int base = first; base < end; base += 32) {
-        const int i = base + lane;
-        int length = 0;
-        if (i < end) {
-            length = tallies.data[i * SPREAD];
-            tallies.data[i * SPREAD] = 0;
-        }
-        Sum sum = WEIGHT(length);
+            places[thread] += classes[i];
+    for (int base = first; base < end; base += PLANNERS) {
+        const int i = base + thread;
+        const int length = i < end ? tallies.data[i * SPREAD] : 0;
+        Sum sum = weight(length);
         for (int step = 1; step < 32; step *= 2) {
             const Sum other = __shfl_up_sync(0xffffffffu, sum, step);
             sum += lane >= step ? other : 0;
         }
-        const Sum own_before = before + sum - WEIGHT(length);
+        __syncthreads();
+        if (lane == 31)
+            sums[warp] = sum;
+        __syncthreads();
+        const Sum own_before = before + sum_of_warps(warp) + sum - weight(length);
         const Sum start = own_before & (((Sum)1 << 40) - 1);
         if (i < end) {
             const bool fits = start + length <= capacity;
@@ -236,23 +244,30 @@ def emit_entries_kernel(
             ranges.data[i] = wp::vec2i(begin, fits ? begin + length : capacity);
             tallies.data[i * SPREAD + EMITTED] = begin;
             const int empty = (int)(own_before >> 40);
-            order.data[length > 0 ? atomicAdd(places + CLASS(length), 1) : tile_count - 1 - empty] = i;
+            order.data[length > 0 ? atomicAdd(places + class_of(length), 1) : tile_count - 1 - empty] = i;
         }
-        before += __shfl_sync(0xffffffffu, sum, 31);
+        before += sum_of_warps(PLANNERS / 32);
     }
-    #undef WEIGHT
-    #undef CLASS
 #endif
-""".replace("SPREAD", str(SPREAD)).replace("EMITTED", str(EMITTED))
-)
-def plan_tiles(
-    tallies: wp.array[int], tile_count: int, capacity: int, ranges: wp.array[wp.vec2i], order: wp.array[int]
-):
-    """Places of the tiles' lists, one after the other, and the order in which tiles are drawn; by one block.
+"""
 
-    Tallies are told where entries begin, and their counts go back to 0.
-    What begins last should not take longest: long lists lie where a surface is seen edge on. Tiles whose lists do not
-    fit have none.
+
+_PLAN_TILES = _PLAN_TILES.replace("SPREAD", str(SPREAD)).replace("EMITTED", str(EMITTED))
+
+
+@wp.func_native(_PLAN_TILES.replace("PLANNERS", str(PLANNERS)))
+def plan_tiles(
+    tallies: wp.array[int],
+    tile_count: int,
+    own_count: int,
+    capacity: int,
+    ranges: wp.array[wp.vec2i],
+    order: wp.array[int],
+):
+    """Places of the tiles' lists, one after the other, and the order in which tiles are drawn; by blocks.
+
+    A block plans ``own_count`` tiles. What begins last should not take longest: long lists lie where a surface is seen
+    edge on. Tiles whose lists do not fit have none. Tallies are told where entries begin.
     """
     ...
 
@@ -262,11 +277,12 @@ def plan_tiles_kernel(
     first: int,
     tallies: wp.array[int],
     tile_count: int,
+    own_count: int,
     capacity: int,
     out_ranges: wp.array[wp.vec2i],
     out_order: wp.array[int],
 ):
-    plan_tiles(tallies, tile_count, capacity, out_ranges, out_order)
+    plan_tiles(tallies, tile_count, own_count, capacity, out_ranges, out_order)
 
 
 _SORT_ENTRIES = """
@@ -470,9 +486,10 @@ def launch_project_entries(gaussians, views, projection, band, splats, counts, t
 
 def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
     """Give every tile of a band its room and its turn."""
-    outputs = [lists.ranges, lists.order]
-    inputs = [tallies, tile_count, capacity]
-    launch(plan_tiles_kernel, PLANNERS, inputs=inputs, outputs=outputs, device=device, block_dim=PLANNERS)
+    blocks = min(-(-tile_count // PLANNERS), MOST_PLANS)
+    inputs, outputs = [tallies, tile_count, -(-tile_count // max(blocks, 1)), capacity], [lists.ranges, lists.order]
+    count = blocks * PLANNERS
+    launch(plan_tiles_kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=PLANNERS)
 
 
 def launch_emit_entries(order, splats, views, gaussian_count, band, tallies, lists, device):

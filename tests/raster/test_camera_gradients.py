@@ -10,7 +10,7 @@ from reference.raster_splats import RasterScene
 from reference.rasterizing import RasterImage, decide, replay
 from reference.single_precision import ROUNDING, rounded
 from scipy.spatial.transform import Rotation
-from support.drawn_hazards import EXPONENTIAL_ROUNDINGS, STABILITY, Drawn, remoteness
+from support.drawn_hazards import APPROXIMATIONS, STABILITY, Drawn, remoteness
 from support.raster_clouds import around, cloud, drawn, set_upstream
 from support.raster_hazards import HAZARDS
 
@@ -177,7 +177,7 @@ def test_every_hazard_is_stable(device, rng, name):
     shown = Drawn(scene, device)
     set_upstream(shown.rasterizer, upstream)
     found = camera_rows(shown.rasterizer)[0].numpy()[0]
-    rounding = ROUNDING * (EXPONENTIAL_ROUNDINGS if wp.get_device(device).is_cuda else 1.0)
+    rounding = ROUNDING * (APPROXIMATIONS if wp.get_device(device).is_cuda else 1.0)
     limit = STABILITY * remoteness(scene, decisions) * (spread + rounding * np.linalg.norm(parts, axis=0))
     assert np.isfinite(found).all()
     assert (np.abs(found - wanted) <= limit).all()

@@ -8,7 +8,7 @@ import warp as wp
 from reference.raster_differences import gradients, random_upstream
 from reference.rasterizing import RasterImage, decide, replay
 from reference.single_precision import ROUNDING, rounded
-from support.drawn_hazards import EXPONENTIAL_ROUNDINGS, STABILITY, Drawn, remoteness
+from support.drawn_hazards import APPROXIMATIONS, STABILITY, Drawn, remoteness
 from support.raster_hazards import HAZARDS, ahead, make
 
 from beam_warp.device.arrays import upload
@@ -46,7 +46,7 @@ def test_every_hazard_is_stable(device, rng, name, antialiased, depth_mode):
     image, got = drawn.image(), drawn.gradients(upstream)
     got |= {name: getattr(image, name)[clear] for name in OUTPUTS}
     factor = STABILITY * remoteness(scene, decisions)
-    rounding = ROUNDING * (EXPONENTIAL_ROUNDINGS if wp.get_device(device).is_cuda else 1.0)
+    rounding = ROUNDING * (APPROXIMATIONS if wp.get_device(device).is_cuda else 1.0)
     for key, array in wanted.items():
         assert np.isfinite(got[key]).all(), key
         limit = factor * (spread[key] + rounding * np.linalg.norm(array))

@@ -13,8 +13,9 @@ from beam_warp.raster.records import GaussianArrays, RasterOptions
 STABILITY = 10.0
 """Factor of the spread under one rounding of the inputs: a few dozen roundings in a chain, as their root sum."""
 
-EXPONENTIAL_ROUNDINGS = 4.0
-"""Error of `quick_exp2` on CUDA: 2^-22 (PTX ISA, ex2.approx.ftz), in roundings of 2^-24."""
+APPROXIMATIONS = 8.0
+"""Errors of what CUDA approximates at each splat, in roundings of 2^-24: 4 of `quick_exp2` and 4 of `quick_divide`, by
+the PTX ISA for ex2.approx.ftz and rcp.approx.ftz."""
 
 
 class Drawn:

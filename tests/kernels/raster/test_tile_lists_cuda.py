@@ -88,7 +88,7 @@ def test_entries_are_sorted(rng, count, kind, threads):
     assert most.numpy()[0] <= SORTED
 
 
-@pytest.mark.parametrize(("tile_count", "room"), [(1, 1.0), (1000, 1.0), (8160, 1.0), (8160, 0.5)])
+@pytest.mark.parametrize(("tile_count", "room"), [(1, 1.0), (1000, 1.0), (8160, 1.0), (8160, 0.5), (50_000, 1.0)])
 def test_tiles_have_their_room_and_their_turn(rng, tile_count, room):
     """Each tile once, long lists before those a fifth shorter; what does not fit has none."""
     lengths = rng.integers(1, 300, tile_count) * 20 ** rng.integers(0, 2, tile_count)
