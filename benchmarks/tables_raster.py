@@ -9,7 +9,7 @@ from raster_plot import draw_growth, draw_stages
 from tables import Row, Rows, cell, figure, number, table
 
 H200, CPU, NEWER = "raster_h200.json", "raster_cpu.json", "raster_gsplat16_h200.json"
-SHARED, ACCURACY = "raster_checkpoints_h200.json", "raster_accuracy_h200.json"
+SHARED, ACCURACY, SIZES = "raster_checkpoints_h200.json", "raster_accuracy_h200.json", "raster_sizes_h200.json"
 
 CASES = ("RGB and depth", "11 channels and depth")
 PARTS = {"forward": "forwards", "training": "forwards and backwards"}
@@ -69,7 +69,17 @@ def frame_of(result: Row) -> str:
     return f"{device}, {scene['width']} × {scene['height']}"
 
 
-@table("raster_frames", H200, CPU)
+@table("raster_sizes", SIZES)
+def sizes(result: Row) -> Rows:
+    """Return frames over the number of Gaussians."""
+    rows = [["Gaussians", "pairs", "forward [ms]", "backward [ms]"]]
+    for entry in result["sizes"]["rows"]:
+        parts = (cell(entry[part]["device_ms"], ".3f") for part in ("forward", "backward"))
+        rows.append([f"{entry['scene']['splats']:,}", f"{entry['pairs']:,}", *parts])
+    return rows
+
+
+@table("raster_frames", ACCURACY, CPU)
 def frames(result: Row, on_cpu: Row) -> Rows:
     """Return frames of all channels; on the CPU in units of its first row."""
     there, here = result["frames"]["ms"], on_cpu["frames"]["ms"]
@@ -118,7 +128,7 @@ def largest(result: Row, scene: str, what: str) -> float:
     return max(stable, default=0.0)
 
 
-@number("raster_compositing_share", H200)
+@number("raster_compositing_share", ACCURACY)
 def compositing_share(result: Row) -> str:
     """Return the share of compositing in a forward and a backward pass of RGB [%]."""
     stages = result["stages"]["RGB and depth"]
@@ -132,7 +142,7 @@ def growth(result: Any, path: Path) -> None:
     draw_growth([result], path)
 
 
-@figure("raster_stages.webp", H200, CPU)
+@figure("raster_stages.webp", ACCURACY, CPU)
 def stages(result: Any, on_cpu: Any, path: Path) -> None:
     """Draw the stages of a frame."""
     draw_stages([result, on_cpu], path)

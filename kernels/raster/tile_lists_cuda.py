@@ -38,6 +38,10 @@ Places = wp.types.vector(length=AHEAD, dtype=int)
 FEW = 128
 """Most entries of a list that are compared with each other: a thread each."""
 
+SPLATS_A_BLOCK = 128
+"""Threads of the blocks that count and emit, a splat each: its rows of tiles are many or few, and a block ends with its
+last thread."""
+
 PLANNERS = 1024
 """Threads of a block that plans."""
 
@@ -79,7 +83,7 @@ def count_entries_kernel(
     out_counts[splat] = count_entries(splat, splats, views[splat / gaussian_count], band, out_tallies)
 
 
-@wp.kernel(launch_bounds=(256, 4))
+@wp.kernel(launch_bounds=(SPLATS_A_BLOCK, 8))
 def project_entries_kernel(
     first: int,
     positions: wp.array[wp.vec3],
@@ -481,7 +485,8 @@ def launch_project_entries(gaussians, views, projection, band, splats, counts, t
     """Project every Gaussian into every view, and count as `launch_count_entries` does."""
     inputs = [*gaussians, views, projection, band]
     outputs = [splats, counts, tallies]
-    launch(project_entries_kernel, len(counts), inputs=inputs, outputs=outputs, device=device, in_order=True)
+    shape = {"block_dim": SPLATS_A_BLOCK, "in_order": True}
+    launch(project_entries_kernel, len(counts), inputs=inputs, outputs=outputs, device=device, **shape)
 
 
 def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
@@ -495,4 +500,5 @@ def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
 def launch_emit_entries(order, splats, views, gaussian_count, band, tallies, lists, device):
     """Write the entries of all tiles of a band, and the owner of every slot."""
     inputs = [order, splats, views, gaussian_count, band, tallies]
-    launch(emit_entries_kernel, len(splats.centers), inputs=inputs, outputs=[lists], device=device, in_order=True)
+    shape = {"block_dim": SPLATS_A_BLOCK, "in_order": True}
+    launch(emit_entries_kernel, len(splats.centers), inputs=inputs, outputs=[lists], device=device, **shape)
