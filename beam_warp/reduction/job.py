@@ -19,7 +19,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.evaluate.certificate import MOST_PAIRS, Certificate, certify, least_bound
 from beam_warp.evaluate.relit import ASSET_PSNR, RelitComparison, require_flip, world
-from beam_warp.evaluate.trials import RelitTrials
+from beam_warp.evaluate.trials import RelitTrials, Trial
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
 from beam_warp.reduction.changes import changed
@@ -387,22 +387,35 @@ class _Search:
         self.tried: list[tuple[int, float]] = []
         self._stored = 0
         self._made: dict[tuple[int, int], GaussianSequence] = {}
-        start = 3 * reducer.views
-        self._draws = reducer.trials.draw("search", range(start, start + TRIED), range(len(reducer.original)))
+        self._draws = self._drawn_from(len(reducer.original))
         self.timed = self._draws[:DRAWN]
         self._delivers = format_of(place).name == "b4d"
         self._scaled = self._delivers or self._keys_pay(reducer.original)
 
+    def _drawn_from(self, frames: int) -> list[Trial]:
+        """Return the draws that the search sees, of the first so many frames."""
+        start = 3 * self._reducer.views
+        return self._reducer.trials.draw("search", range(start, start + TRIED), range(frames))
+
     def _keys_pay(self, original: GaussianSequence) -> bool:
-        """Return whether keys save more than they cost, by the first clip of the original."""
+        """Return whether keys save more than they cost, by the first clip of the original.
+
+        They are as far apart as what is left of a bound lets them be; without a bound, by those of delivery.
+        """
         if len(original) < 2:
             return False
         some = replace(original, frame_count=min(len(original), CLIP_FRAMES), metadata={})
-        sizes = []
-        for scale in (None, 1.0):
-            paths = converters.write(some, self._place.with_stem(f"pilot_{scale}"), _written_as(scale))
-            sizes.append(sum(path.stat().st_size for path in paths))
-        return sizes[1] < FOR_GAUSSIANS * sizes[0]
+        whole = self._written(some, None)[1]
+        if self._options.bound is None:
+            return self._written(some, 1.0)[1] < FOR_GAUSSIANS * whole
+        left, draws = (1.0 - FOR_GAUSSIANS) * self._options.bound, self._drawn_from(len(some))
+        for scale in SCALES:
+            keyed, size = self._written(some, scale)
+            if size >= FOR_GAUSSIANS * whole:  # and finer ones take more
+                return False
+            if self.error(keyed, draws) <= left:
+                return True
+        return False
 
     def candidate(self, count: int, steps: int | None = None) -> GaussianSequence:
         """Return the reduced asset of a number of Gaussians, made once."""
@@ -411,15 +424,20 @@ class _Search:
             self._made[key] = self._reducer.reduced(count, steps=key[1])
         return self._made[key]
 
-    def error(self, sequence: GaussianSequence) -> float:
-        """Return the worst error of an asset on the search's draws."""
-        return float(self._comparison.errors(sequence, self._draws, keep=True).values(self._options.measure).max())
+    def error(self, sequence: GaussianSequence, draws: Sequence[Trial] | None = None) -> float:
+        """Return the worst error of an asset on draws, those of the search if none are given."""
+        errors = self._comparison.errors(sequence, draws or self._draws, keep=True)
+        return float(errors.values(self._options.measure).max())
 
     def stored(self, count: int, scale: float | None, steps: int | None = None) -> tuple[GaussianSequence, int]:
         """Return a candidate as it reads once it is stored, and its size [byte]."""
+        return self._written(self.candidate(count, steps), scale)
+
+    def _written(self, sequence: GaussianSequence, scale: float | None) -> tuple[GaussianSequence, int]:
+        """Return what a stored asset reads as, and its size [byte]."""
         self._stored += 1  # files that were read are not replaced
         place = self._place.with_stem(f"{self._place.stem}{self._stored}")
-        paths = converters.write(self.candidate(count, steps), place, _written_as(scale))
+        paths = converters.write(sequence, place, _written_as(scale))
         return converters.read(place), sum(path.stat().st_size for path in paths)
 
     def more(self, count: int, scale: float | None, *, last: bool) -> tuple[int, float | None]:
