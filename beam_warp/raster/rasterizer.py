@@ -171,8 +171,8 @@ class Rasterizer:
             self._buffers.tallies.zero_()
             forward.project(self._buffers, gaussians)
             forward.gather_channels(self._buffers)
-            self._bands = forward.plan_bands(self._buffers)
             self._buffers.wait_for(self._buffers.gathering)
+            self._bands = forward.plan_bands(self._buffers)
             for band in self._bands:
                 if len(self._bands) > 1:
                     forward.count_pairs(self._buffers, band)
