@@ -485,8 +485,15 @@ def launch_project_entries(gaussians, views, projection, band, splats, counts, t
     """Project every Gaussian into every view, and count as `launch_count_entries` does."""
     inputs = [*gaussians, views, projection, band]
     outputs = [splats, counts, tallies]
-    shape = {"block_dim": SPLATS_A_BLOCK, "in_order": True}
-    launch(project_entries_kernel, len(counts), inputs=inputs, outputs=outputs, device=device, **shape)
+    launch(
+        project_entries_kernel,
+        len(counts),
+        inputs=inputs,
+        outputs=outputs,
+        device=device,
+        block_dim=SPLATS_A_BLOCK,
+        in_order=True,
+    )
 
 
 def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
@@ -500,5 +507,12 @@ def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
 def launch_emit_entries(order, splats, views, gaussian_count, band, tallies, lists, device):
     """Write the entries of all tiles of a band, and the owner of every slot."""
     inputs = [order, splats, views, gaussian_count, band, tallies]
-    shape = {"block_dim": SPLATS_A_BLOCK, "in_order": True}
-    launch(emit_entries_kernel, len(splats.centers), inputs=inputs, outputs=[lists], device=device, **shape)
+    launch(
+        emit_entries_kernel,
+        len(splats.centers),
+        inputs=inputs,
+        outputs=[lists],
+        device=device,
+        block_dim=SPLATS_A_BLOCK,
+        in_order=True,
+    )
