@@ -32,6 +32,7 @@ class Rasterizer:
     All arrays stay on the device and where they are. `draw` waits for the device, to learn how much room the frame
     takes; `redraw`, and `backward` and `back_project` from their second call on, wait for nothing and allocate nothing,
     so that they can be captured in a CUDA graph. Capture again after a `draw` that changed `pair_capacity`.
+    Threads must not work on one device at the same time: drawing changes Warp's current stream there for a moment.
 
     Gaussians that are not finite, or whose quaternion is 0, are not drawn; their own gradients may not be finite.
 
