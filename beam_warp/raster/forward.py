@@ -69,7 +69,7 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
 
 
 def gather_channels(buffers: FrameBuffers) -> None:
-    """Write every splat's row of channels; where there are none, rows stay 0. Compositing waits for it."""
+    """Write every splat's row of channels; where there are none, rows stay 0. Wait for it before compositing."""
     with buffers.beside(buffers.gathering):
         for i, rows in enumerate(buffers.rows if buffers.channels.count else ()):
             launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.matrix, buffers.device)

@@ -169,7 +169,7 @@ class Rasterizer:
         require_gaussians(gaussians, self._count, self._buffers.channels, self.device)
         self._gaussians = None  # until all of it is drawn: a frame that is refused cannot be drawn again
         with wp.ScopedDevice(self.device):
-            self._buffers.tallies.zero_()
+            self._buffers.tallies.zero_()  # a frame that was refused may have left some
             forward.project(self._buffers, gaussians)
             forward.gather_channels(self._buffers)
             self._buffers.wait_for(self._buffers.gathering)
@@ -196,7 +196,7 @@ class Rasterizer:
             return self.draw(gaussians)
         with wp.ScopedDevice(self.device):
             forward.project(self._buffers, gaussians)
-            forward.gather_channels(self._buffers)
+            forward.gather_channels(self._buffers)  # beside the lists: `relist` and then `redraw_values` take longer
             forward.list_pairs(self._buffers)
             self._buffers.wait_for(self._buffers.gathering)
             self._composite()

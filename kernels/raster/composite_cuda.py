@@ -76,8 +76,8 @@ CENTER, SHAPE, SLOPE, BEND = (wp.constant(k) for k in range(4))
 def reaches(center: wp.vec4, shape: wp.vec4, first: wp.vec2, last: wp.vec2) -> int:
     """1 if a splat reaches pixels, ``first`` and ``last`` being the centres of those at the corners of their box.
 
-    Where their box, a little enlarged, does not hold the splat's centre, its least squared distance in standard
-    deviations is on one of the two sides that face the centre. No root and no exact quotient is needed.
+    Where their box, a little enlarged, does not hold the splat's centre, its least squared whitened distance is on one
+    of the two sides that face the centre. No root and no exact quotient is needed.
     """
     x0 = first[0] - center[0]
     y0 = first[1] - center[1]

@@ -71,14 +71,12 @@ class Splats:
     """Splats of every (view, Gaussian), view by view.
 
     A splat that is not drawn has an opacity of 0. With d the pixel's offset from the centre, alpha is
-    2^(log2 o - e0^2 - e1^2), e0 = s0 dx, e1 = s2 (dy - s1 dx): what GPUs have is the power of two, and a pixel then
-    costs two operations less than by exp(-|e|^2 / 2).
+    2^(log2 o - e0^2 - e1^2), e0 = s0 dx, e1 = s2 (dy - s1 dx), and c is `WHITENING`: what GPUs have is the power of
+    two, and a pixel then costs two operations less than by exp(-|e|^2 / 2).
     """
 
     centers: wp.array[wp.vec4]  # x, y [pixel], log2 of opacity, depth of the centre [m]
-    shapes: wp.array[
-        wp.vec4
-    ]  # s0 = c/sqrt(xx), s1 = xy/xx, s2 = c sqrt(xx/det), c = WHITENING, of the filtered covariance; reach [m]
+    shapes: wp.array[wp.vec4]  # s0 = c/sqrt(xx), s1 = xy/xx, s2 = c sqrt(xx/det) of the filtered covariance; reach [m]
     slopes: wp.array[wp.vec4]  # l = 1 + gx dx + gy dy; e = exx dx^2 + 2 exy dx dy + eyy dy^2: gx, gy, exx, exy
     bends: wp.array[float]  # eyy
     normals: wp.array[wp.vec3]  # unit, in the world, towards the camera: of the surface of largest response; or none

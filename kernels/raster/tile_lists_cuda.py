@@ -27,8 +27,8 @@ SORTED = 1024
 SPREAD = wp.constant(8)
 """Numbers of a tile's tally: atomics on one sector of 32 bytes wait for each other. The first is that of its pairs."""
 
-EMITTED = wp.constant(4)
-"""Place in a tally of where the tile's next entry goes."""
+NEXT_PLACE = wp.constant(4)
+"""The number of a tally that tells where, among all entries, the tile's next one goes."""
 
 AHEAD = 4
 """Tiles of a row whose pairs are emitted together."""
@@ -110,12 +110,12 @@ def project_entries_kernel(
 #if defined(__CUDA_ARCH__)
     #pragma unroll
     for (int k = 0; k < AHEAD; ++k)
-        places[k] = k < count ? atomicAdd(tallies.data + (tile + k) * SPREAD + EMITTED, 1) : 0;
+        places[k] = k < count ? atomicAdd(tallies.data + (tile + k) * SPREAD + NEXT_PLACE, 1) : 0;
 #endif
     return places;
 """.replace("AHEAD", str(AHEAD))
     .replace("SPREAD", str(SPREAD))
-    .replace("EMITTED", str(EMITTED))
+    .replace("NEXT_PLACE", str(NEXT_PLACE))
 )
 def take_places(tallies: wp.array[int], tile: int, count: int) -> Places:
     """Places among all entries for one of each of ``count`` tiles side by side, at most `AHEAD`."""
@@ -246,7 +246,7 @@ _PLAN_TILES = """
             const bool fits = start + length <= capacity;
             const int begin = fits ? (int)start : capacity;
             ranges.data[i] = wp::vec2i(begin, fits ? begin + length : capacity);
-            tallies.data[i * SPREAD + EMITTED] = begin;
+            tallies.data[i * SPREAD + NEXT_PLACE] = begin;
             const int empty = (int)(own_before >> 40);
             order.data[length > 0 ? atomicAdd(places + class_of(length), 1) : tile_count - 1 - empty] = i;
         }
@@ -256,7 +256,7 @@ _PLAN_TILES = """
 """
 
 
-_PLAN_TILES = _PLAN_TILES.replace("SPREAD", str(SPREAD)).replace("EMITTED", str(EMITTED))
+_PLAN_TILES = _PLAN_TILES.replace("SPREAD", str(SPREAD)).replace("NEXT_PLACE", str(NEXT_PLACE))
 
 
 @wp.func_native(_PLAN_TILES.replace("PLANNERS", str(PLANNERS)))

@@ -15,7 +15,7 @@ from beam_warp import GaussianCloud, rasterize
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.raster.composite_cuda import STRIDE
-from beam_warp.raster import forward, rasterizer
+from beam_warp.raster import buffers, forward, rasterizer
 from beam_warp.raster.gbuffer import rasterize_backward
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
@@ -228,6 +228,20 @@ def test_checkpoints_change_no_image_and_hardly_a_gradient(device, rng, opacitie
     assert_same(found[0][:6], found[1][:6])
     for one, other in zip(found[0][6:], found[1][6:], strict=True):
         assert np.linalg.norm(one - other) <= 1e-5 * np.linalg.norm(one)
+
+
+@pytest.mark.parametrize("depth", ["exact", "plane"])
+def test_large_images_have_the_bits_of_small_ones(device, rng, monkeypatch, depth):
+    """A lane has two pixels on CUDA where tiles are many, one where they are few. Images end within tiles."""
+    made = cloud(rng, 6_000)
+    values = rng.uniform(0, 1, (6_000, 19)).astype(np.float32)
+    cameras, found = [around(33, 20), around(17, 30, 80.0)], []
+    for held in (16, 0):
+        monkeypatch.setattr(buffers, "BLOCKS_HELD", held)
+        drawer, _ = drawn(made, cameras, device, values, options=RasterOptions(depth=depth))
+        filled(np.random.default_rng(1), drawer)
+        found.append(state(drawer))
+    assert_same(*found)
 
 
 @pytest.mark.parametrize("limit", [2**24, 300])

@@ -10,7 +10,7 @@ from beam_warp.kernels.raster.bin_tiles import SIDE, Band, SplatOrder, TileLists
 from beam_warp.kernels.raster.project import LOG_CUT, Projection, RasterView, Splats
 from beam_warp.kernels.raster.splat_rows import EXTENT_MARGIN, RELATIVE_MARGIN
 from beam_warp.kernels.raster.tile_lists_cuda import (
-    EMITTED,
+    NEXT_PLACE,
     SORTED,
     SPREAD,
     launch_emit_entries,
@@ -153,7 +153,7 @@ def test_every_pair_that_is_counted_is_emitted(rng):
     counted = tallies.numpy()[:: int(SPREAD)]
     launch_plan_tiles(tallies, tile_count, pairs, lists, device)
     launch_emit_entries(order, splats, views, count, band, tallies, lists, device)
-    left, places = tallies.numpy().reshape(tile_count, -1)[:, [0, EMITTED]].T
+    left, places = tallies.numpy().reshape(tile_count, -1)[:, [0, NEXT_PLACE]].T
     assert pairs > 2 * count
     assert np.median(np.abs(shift)) < 1e-5
     assert not left.any()
