@@ -39,6 +39,8 @@ STAGES = {
     "launch_composite_adjoint_cuda": "composite adjoint",
     "launch_back_project_cpu": "back-projection",
     "launch_back_project_cuda": "back-projection",
+    "launch_find_slots": "sums over pairs",
+    "launch_find_far_slots": "sums over pairs",
     "launch_sum_pairs": "sums over pairs",
     "launch_sum_views": "sums over pairs",
     "launch_resolve_sums": "sums over pairs",
@@ -52,7 +54,6 @@ STAGES = {
 SORT_AFTER = {"depth keys": "sort by depth", "count and emit": "sort by tile"}
 """Stage of a sort, by the stage before it."""
 
-SCAN = "count and emit"
 CLEAR = "clear gradients"
 REST = "rest: fills, gaps"
 FORWARD = (
@@ -91,7 +92,8 @@ class StageClock:
             for name, owner in stage_launchers().items():
                 self._wrap(patches, owner, name, STAGES[name])
             self._wrap(patches, wp.utils, "radix_sort_pairs", None)
-            self._wrap(patches, wp.utils, "array_scan", SCAN)
+            scan = "sums over pairs" if self.device.is_cuda else "count and emit"
+            self._wrap(patches, wp.utils, "array_scan", scan)
             self._wrap(patches, backward.BackwardBuffers, "begin", CLEAR)
             yield
 

@@ -15,6 +15,7 @@ from beam_warp.kernels.raster.composite_adjoint_cuda import launch_composite_adj
 from beam_warp.kernels.raster.pair_sums import launch_resolve_sums, launch_sum_pairs
 from beam_warp.kernels.raster.project import CameraMove, Splats, launch_project_adjoint
 from beam_warp.raster.buffers import FrameBuffers
+from beam_warp.raster.forward import find_slots
 from beam_warp.raster.layout import Rows, channel_rows
 from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianArrays, GaussianGradients, RasterImages
 
@@ -62,6 +63,7 @@ class BackwardBuffers:
         drawn = self._drawn
         if not drawn.pair_capacity:
             return
+        find_slots(drawn)
         upstream = Adjoints()
         upstream.alpha, upstream.depth = self.images.alpha, self.images.depth
         upstream.median_depth = self.images.median_depth
@@ -127,6 +129,7 @@ def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> N
     if not drawn.pair_capacity:
         return
     back_project = launch_back_project_cuda if drawn.device.is_cuda else launch_back_project_cpu
+    find_slots(drawn)
     pairs = drawn.pair_rows(pixels.shape[1])
     drawn.begin_sums()
     back_project(drawn.frame, drawn.drawn, Rows.of(pixels).vectors, pairs.vectors, drawn.device)

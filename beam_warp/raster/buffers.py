@@ -14,7 +14,7 @@ from beam_warp.kernels.raster.channel_rows import ChannelBlocks
 from beam_warp.kernels.raster.composite import Checkpoints, Images, RasterFrame
 from beam_warp.kernels.raster.composite_cuda import STRIDE
 from beam_warp.kernels.raster.project import Projection, RasterView, Splats
-from beam_warp.kernels.raster.tile_lists_cuda import SPREAD
+from beam_warp.kernels.raster.tile_lists_cuda import SPREAD, rank_bits
 from beam_warp.raster.layout import ChannelRanges, Rows, ViewLayout, channel_rows, pass_lengths
 from beam_warp.raster.records import RasterImages, RasterOptions
 from beam_warp.world.camera import Camera
@@ -23,6 +23,10 @@ BLOCKS_HELD = 16
 """Blocks of the way back that a multiprocessor holds at most. Where there are more tiles than all of them hold, no part
 of the GPU waits for the longest list. Then lists stay whole, for each part of one costs a little, and a lane draws two
 pixels."""
+
+
+RECORD = 16
+"""Floats of a splat that lie side by side: its centre, shape, slope, and up to four channels."""
 
 
 class FrameBuffers:
@@ -42,8 +46,9 @@ class FrameBuffers:
         blocks: Where the channels of a splat come from.
         keys: Depths to sort splats by; like ``order.splats``, of twice the length, which sorting needs. None on CUDA.
         order: The splats in depth order, on CUDA in their own order, and where each one's pairs end.
-        pairs: The (tile, splat) pairs of a band; on CUDA only the owners.
+        pairs: The (tile, splat) pairs of a band; none on CUDA.
         tallies: Numbers of pairs of each tile of a band, on CUDA.
+        pair_total: Number of pairs of the band that was counted last, one number.
         frame: Input of compositing, for kernels.
         drawn: Images besides channels, for kernels.
         channel_images: Images of channels, a pass each.
@@ -51,8 +56,8 @@ class FrameBuffers:
         checkpoints: What pixels have come to on their way through long lists, on CUDA; empty unless asked for.
         passed: Sums of channels at checkpoints, a pass each.
         has_few_tiles: Whether the longest lists say how long a frame takes on CUDA.
-        summing: The stream on which counts of pairs are summed up while tiles are planned; None without CUDA.
-        gathering: The stream on which channels are gathered meanwhile; None without CUDA.
+        may_lack_ranks: Whether a splat may reach more tiles than there are bits for the ranks of its pairs, on CUDA.
+        gathering: The stream on which channels are gathered while lists are made; None without CUDA.
     """
 
     def __init__(
@@ -77,9 +82,11 @@ class FrameBuffers:
         self.channels = channels
         self.device = device
         self.exact = options.depth == "exact"
-        self.summing, self.gathering = (wp.Stream(device) if device.is_cuda else None for _ in range(2))
+        self.gathering = wp.Stream(device) if device.is_cuda else None
         tile_count = int(self.layout.first_tiles[-1])
         self.has_few_tiles = device.is_cuda and tile_count <= BLOCKS_HELD * device.sm_count
+        self._rank_bits = rank_bits(self.splat_count)
+        self.may_lack_ranks = max(np.bincount(self.layout.tile_views), default=0) >= 1 << self._rank_bits
         self._has_checkpoints = checkpoints and self.has_few_tiles
         if images_of is not None:
             self._require_room(images_of)
@@ -102,7 +109,7 @@ class FrameBuffers:
     @property
     def pair_capacity(self) -> int:
         """Number of pairs there is room for."""
-        return len(self.pairs.owners)
+        return len(self.frame.lists.splats)
 
     def reserve(self, capacity: int) -> None:
         """Make room for pairs."""
@@ -111,7 +118,7 @@ class FrameBuffers:
             emitted = 0 if self.device.is_cuda else capacity
             self.pairs.tiles = wp.zeros(2 * emitted, dtype=int)  # the sort wants room for as many again
             self.pairs.slots = wp.zeros(2 * emitted, dtype=int)
-            self.pairs.owners = wp.zeros(capacity, dtype=int)
+            self.pairs.owners = wp.zeros(emitted, dtype=int)
             self.listed_tiles = self.pairs.tiles[:emitted] if emitted else self.pairs.tiles
             lists = TileLists()
             tile_count = int(self.layout.first_tiles[-1])
@@ -119,10 +126,11 @@ class FrameBuffers:
             lists.splats = wp.zeros(capacity, dtype=int)
             lists.slots = self.pairs.slots
             if self.device.is_cuda:
-                lists.order = wp.zeros(tile_count, dtype=int)
+                lists.order, lists.ends = (wp.zeros(tile_count, dtype=int) for _ in range(2))
                 lists.slots = wp.zeros(capacity, dtype=int)
                 lists.entries, lists.parted = (wp.zeros(capacity, dtype=wp.uint64) for _ in range(2))
-                lists.owners = self.pairs.owners
+                lists.ranks = wp.zeros(capacity, dtype=wp.uint16)
+                lists.rank_bits = self._rank_bits
                 lists.summed = wp.zeros(capacity, dtype=wp.uint8)
             self._reserve_checkpoints(capacity)
         self.frame.lists = lists
@@ -188,6 +196,8 @@ class FrameBuffers:
         count = self.splat_count
         self.splats = self.zero_splats()
         self.rows = channel_rows(count, self.channels.count, self.device)
+        if count and self.device.is_cuda:
+            self._interleave()
         self.blocks = self.zero_blocks(0, self.splats.normals)
         sorts = not self.device.is_cuda
         self.keys = wp.zeros(2 * count * sorts, dtype=int)
@@ -195,7 +205,22 @@ class FrameBuffers:
         self.order.splats = wp.zeros(2 * count, dtype=int) if sorts else wp.array(np.arange(count), dtype=int)
         self.order.counts = wp.zeros(count, dtype=int)
         self.order.ends = wp.zeros(count, dtype=int)
+        self.pair_total = self.order.ends[-1:] if sorts and count else wp.zeros(1, dtype=int)
         self.tallies = wp.zeros(0 if sorts else int(self.layout.first_tiles[-1]) * SPREAD, dtype=int)
+
+    def _interleave(self) -> None:
+        """Put what compositing on CUDA reads of a splat side by side: splats are read in the order of lists.
+
+        Reading 16 bytes of memory takes as long as reading 64. Rows of more than four channels stay by themselves.
+        """
+        count = self.splat_count
+        self._records = wp.zeros((count, RECORD), dtype=float)
+        names, apart = ("centers", "shapes", "slopes"), self._records.strides[0]
+        for i, name in enumerate(names):
+            place = self._records.ptr + 16 * i
+            setattr(self.splats, name, wp.array(ptr=place, shape=count, strides=(apart,), dtype=wp.vec4))
+        if [rows.length for rows in self.rows] == [4]:
+            self.rows = [Rows.of(self._records[:, 4 * len(names) :])]
 
     def _allocate_images(self, images_of: FrameBuffers | None) -> None:
         """Allocate images, or take the first pixels of another frame's."""

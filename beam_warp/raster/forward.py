@@ -23,6 +23,8 @@ from beam_warp.kernels.raster.project import launch_project
 from beam_warp.kernels.raster.tile_lists_cuda import (
     launch_count_entries,
     launch_emit_entries,
+    launch_find_far_slots,
+    launch_find_slots,
     launch_plan_tiles,
     launch_project_entries,
 )
@@ -30,7 +32,7 @@ from beam_warp.raster.buffers import FrameBuffers
 from beam_warp.raster.records import GaussianArrays
 
 MAX_BAND_PAIRS = 2**24
-"""Most (tile, splat) pairs held at a time: 24 bytes each, 29 on CUDA, and on the way back up to 128 more for each
+"""Most (tile, splat) pairs held at a time: 24 bytes each, 27 on CUDA, and on the way back up to 128 more for each
 length of rows. Images that need more are drawn in bands of tile rows."""
 
 MAX_ROW_PAIRS = 2**29
@@ -51,15 +53,8 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
     if is_cuda:
         counted = buffers.order.counts, buffers.tallies
         launch_project_entries(*inputs, _begin_band(buffers, tiles), buffers.splats, *counted, buffers.device)
-        _sum_counts(buffers)
     else:
         launch_project(*inputs, buffers.splats, buffers.device)
-    if buffers.channels.colors:
-        launch_evaluate_colors(
-            gaussians.positions, gaussians.radiance, buffers.views, buffers.blocks.colors, buffers.device
-        )
-    if buffers.channels.values:
-        buffers.blocks.values = gaussians.values
     if is_cuda:  # every tile sorts its own list
         return
     launch_key_splats(len(buffers.splats.centers), buffers.splats, buffers.keys, buffers.order.splats, buffers.device)
@@ -68,11 +63,21 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
     count_pairs(buffers, tiles)
 
 
+def evaluate_colors(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
+    """Find the colour of every splat, and where its values are. Wait for it as for `gather_channels`, which follows."""
+    if buffers.channels.values:
+        buffers.blocks.values = gaussians.values
+    if buffers.channels.colors:
+        seen = (gaussians.positions, gaussians.radiance, buffers.views, buffers.blocks.colors)
+        with buffers.beside(buffers.gathering):
+            launch_evaluate_colors(*seen, buffers.device)
+
+
 def gather_channels(buffers: FrameBuffers) -> None:
     """Write every splat's row of channels; where there are none, rows stay 0. Wait for it before compositing."""
     with buffers.beside(buffers.gathering):
         for i, rows in enumerate(buffers.rows if buffers.channels.count else ()):
-            launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.matrix, buffers.device)
+            launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.fours, buffers.device)
 
 
 def plan_bands(buffers: FrameBuffers) -> list[tuple[int, int]]:
@@ -89,6 +94,8 @@ def plan_bands(buffers: FrameBuffers) -> list[tuple[int, int]]:
         band = (int(first_tiles[first]), int(first_tiles[end]))
         if end - first < len(first_tiles) - 1:  # all of them are counted since they were projected
             count_pairs(buffers, band)
+        if buffers.device.is_cuda:
+            _plan_tiles(buffers)
         pairs = counted_pairs(buffers)
         if pairs > MAX_BAND_PAIRS and end - first > 1:
             middle = (first + end) // 2
@@ -107,14 +114,14 @@ def plan_bands(buffers: FrameBuffers) -> list[tuple[int, int]]:
 
 
 def count_pairs(buffers: FrameBuffers, tiles: tuple[int, int]) -> None:
-    """Count the pairs of a band of tiles, splat by splat in depth order, and sum the counts up."""
+    """Count the pairs of a band of tiles; elsewhere than on CUDA splat by splat in depth order, and sum them up."""
     band, order = _begin_band(buffers, tiles), buffers.order
     inputs = (buffers.splats, buffers.views, buffers.gaussian_count, band, order.counts)
     if buffers.device.is_cuda:
         buffers.tallies.zero_()
         launch_count_entries(buffers.splat_count, *inputs, buffers.tallies, buffers.device)
-    else:
-        launch_count_pairs(order.splats, *inputs, buffers.device)
+        return
+    launch_count_pairs(order.splats, *inputs, buffers.device)
     _sum_counts(buffers)
 
 
@@ -127,40 +134,58 @@ def _begin_band(buffers: FrameBuffers, tiles: tuple[int, int]) -> Band:
 
 
 def _sum_counts(buffers: FrameBuffers) -> None:
-    """Find where the pairs of every splat end; who asks for it waits."""
+    """Find where the pairs of every splat end."""
     if buffers.splat_count:
-        with buffers.beside(buffers.summing):
-            wp.utils.array_scan(buffers.order.counts, buffers.order.ends, inclusive=True)
+        wp.utils.array_scan(buffers.order.counts, buffers.order.ends, inclusive=True)
+
+
+def _plan_tiles(buffers: FrameBuffers) -> None:
+    """Give every tile of the band that was counted last its place in the lists, on CUDA."""
+    lists, band = buffers.frame.lists, buffers.frame.band
+    tiles = (buffers.tallies, band.end_tile - band.first_tile)
+    launch_plan_tiles(*tiles, buffers.pair_capacity, lists, buffers.pair_total, buffers.device)
 
 
 def counted_pairs(buffers: FrameBuffers) -> int:
-    """Return how many pairs the band that was counted last has; waits for the device."""
+    """Return how many pairs the band that was counted last has; waits for the device.
+
+    On CUDA its tiles must be planned.
+    """
     if not buffers.splat_count:
         return 0
-    buffers.wait_for(buffers.summing)
-    if buffers.splat_count * int(buffers.layout.first_tiles[-1]) < 2**31:
-        return int(buffers.order.ends[-1:].numpy()[0])
+    if buffers.device.is_cuda or buffers.splat_count * int(buffers.layout.first_tiles[-1]) < 2**31:
+        return int(buffers.pair_total.numpy()[0])
     return int(buffers.order.counts.numpy().sum(dtype=np.int64))  # the ends may be beyond the range of integers
 
 
 def list_pairs(buffers: FrameBuffers) -> None:
     """List the splats of every tile of the band that was counted last."""
     frame, pairs = buffers.frame, buffers.pairs
-    band = frame.band
-    tile_count = band.end_tile - band.first_tile
-    inputs = (buffers.order, buffers.splats, buffers.views, buffers.gaussian_count, band)
+    inputs = (buffers.splats, buffers.views, buffers.gaussian_count, frame.band)
     if buffers.device.is_cuda:
-        launch_plan_tiles(buffers.tallies, tile_count, buffers.pair_capacity, frame.lists, buffers.device)
-        buffers.wait_for(buffers.summing)
+        _plan_tiles(buffers)
         launch_emit_entries(*inputs, buffers.tallies, frame.lists, buffers.device)
         return
     frame.lists.ranges.zero_()
     if not buffers.pair_capacity:
         return
+    tile_count = frame.band.end_tile - frame.band.first_tile
     buffers.listed_tiles.fill_(tile_count)  # sorts behind every tile: room that no pair takes
-    launch_emit_pairs(*inputs, pairs, buffers.device)
+    launch_emit_pairs(buffers.order, *inputs, pairs, buffers.device)
     wp.utils.radix_sort_pairs(pairs.tiles, pairs.slots, buffers.pair_capacity, end_bit=tile_count.bit_length())
     launch_find_ranges(pairs, tile_count, frame.lists, buffers.device)
+
+
+def find_slots(buffers: FrameBuffers) -> None:
+    """Give every pair of the band that was drawn last its slot, where it has none since it was listed: on CUDA."""
+    if not buffers.device.is_cuda:
+        return
+    _sum_counts(buffers)
+    frame = buffers.frame
+    launch_find_slots(buffers.pair_capacity, buffers.order, frame.lists, frame.lists.slots, buffers.device)
+    if buffers.may_lack_ranks:
+        views = (frame.views, frame.tile_views, frame.gaussian_count)
+        launch_find_far_slots(buffers.order, frame.splats, *views, frame.band, frame.lists, buffers.device)
 
 
 def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) -> None:
@@ -170,7 +195,6 @@ def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) ->
         frame, drawn = (buffers.frame, rows.vectors, buffers.exact), (image.vectors, buffers.drawn)
         if draw is None and buffers.device.is_cuda:
             notes, colored = (buffers.checkpoints, passed.vectors), buffers.channels.count > 0
-            pixels = 1 if buffers.has_few_tiles else 2
-            launch_composite_cuda(*frame, colored, pixels, *drawn, *notes, buffers.device)
+            launch_composite_cuda(*frame, colored, buffers.has_few_tiles, *drawn, *notes, buffers.device)
         else:
             (draw or launch_composite_cpu)(*frame, *drawn, buffers.device)

@@ -90,10 +90,12 @@ class Rows:
     Attributes:
         matrix: ``(N, K)`` float.
         vectors: The same memory, ``(N,)`` vectors of K.
+        fours: The same memory, ``(N, K // 4)`` vectors of four.
     """
 
     matrix: wp.array
     vectors: wp.array
+    fours: wp.array
 
     @property
     def length(self) -> int:
@@ -102,12 +104,15 @@ class Rows:
 
     @classmethod
     def of(cls, matrix: wp.array) -> Rows:
-        """Read a compact matrix as rows."""
+        """Read a matrix, whose rows are compact, as rows."""
         count, length = matrix.shape
-        dtype = channel_vector(length)
+        dtype, device, start = channel_vector(length), matrix.device, matrix.ptr
         if not count:
-            return cls(matrix, wp.zeros(0, dtype=dtype, device=matrix.device))
-        return cls(matrix, wp.array(ptr=matrix.ptr, shape=count, dtype=dtype, device=matrix.device))
+            return cls(matrix, wp.zeros(0, dtype=dtype, device=device), wp.zeros((0, 1), dtype=wp.vec4, device=device))
+        apart = matrix.strides[0]
+        vectors = wp.array(ptr=start, shape=count, strides=(apart,), dtype=dtype, device=device)
+        fours = wp.array(ptr=start, shape=(count, length // 4), strides=(apart, 16), dtype=wp.vec4, device=device)
+        return cls(matrix, vectors, fours)
 
     @classmethod
     def zeros(cls, count: int, length: int, device: Any) -> Rows:

@@ -23,7 +23,8 @@ from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianArrays, Gaussian
 from beam_warp.world.camera import Camera
 
 MAX_SPLATS = 2**26 - 1
-"""Most splats, Gaussians times cameras. The way back sums up to 32 numbers for each, and counts them in 32 bits."""
+"""Most splats, Gaussians times cameras. The way back sums up to 32 numbers for each, and counts them in 32 bits; an
+entry of a list on CUDA leaves bits for the rank of a pair."""
 
 
 class Rasterizer:
@@ -150,7 +151,7 @@ class Rasterizer:
     def note_pair_count(self, counts: wp.array, place: int) -> None:
         """Write what `pair_count` returns for a single band to ``counts[place]``, an int; waits for nothing."""
         if self._buffers.splat_count:
-            wp.copy(counts, self._buffers.order.ends, place, self._buffers.splat_count - 1, 1)
+            wp.copy(counts, self._buffers.pair_total, place, 0, 1)
 
     def draw(self, gaussians: GaussianArrays) -> RasterImages:
         """Draw Gaussians, and make room for their pairs.
@@ -171,6 +172,7 @@ class Rasterizer:
         with wp.ScopedDevice(self.device):
             self._buffers.tallies.zero_()  # a frame that was refused may have left some
             forward.project(self._buffers, gaussians)
+            forward.evaluate_colors(self._buffers, gaussians)
             forward.gather_channels(self._buffers)
             self._buffers.wait_for(self._buffers.gathering)
             self._bands = forward.plan_bands(self._buffers)
@@ -196,6 +198,7 @@ class Rasterizer:
             return self.draw(gaussians)
         with wp.ScopedDevice(self.device):
             forward.project(self._buffers, gaussians)
+            forward.evaluate_colors(self._buffers, gaussians)
             forward.gather_channels(self._buffers)  # beside the lists: `relist` and then `redraw_values` take longer
             forward.list_pairs(self._buffers)
             self._buffers.wait_for(self._buffers.gathering)
@@ -214,7 +217,10 @@ class Rasterizer:
         if self.is_whole:
             with wp.ScopedDevice(self.device):
                 forward.project(self._buffers, gaussians)
+                forward.evaluate_colors(self._buffers, gaussians)
                 forward.list_pairs(self._buffers)
+                if self._buffers.channels.colors:
+                    self._buffers.wait_for(self._buffers.gathering)
 
     def redraw_values(self) -> RasterImages:
         """Draw the last frame again after the contents of its values changed and nothing else, without waiting.

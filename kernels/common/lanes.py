@@ -149,7 +149,8 @@ _SHARE_SPLATS = """
     if (action == 0) {
         place[kind * COUNT] = make_float4(row[0], row[1], row[2], row[3]);
     } else if (action == 1) {
-        const float4* source = reinterpret_cast<const float4*>(channels.data) + size_t(splat) * (LENGTH / 4);
+        const char* row = reinterpret_cast<const char*>(channels.data) + size_t(splat) * channels.strides[0];
+        const float4* source = reinterpret_cast<const float4*>(row);
         #pragma unroll
         for (int i = 0; i < LENGTH / 4; ++i)
             place[(KINDS + i) * COUNT] = __ldg(source + i);
@@ -181,6 +182,18 @@ _ADD_WHOLE = """
         held[0] += __shfl_xor_sync(0xffffffffu, held[0], STEP);
 """
 
+_SUM_LANES = """
+        {
+            float held[WIDTH];
+            #pragma unroll
+            for (int i = 0; i < WIDTH; ++i)
+                held[i] = FIRST + i < LENGTH ? numbers[FIRST + i] : 0.0f;
+            int place = FIRST;
+HALVINGS            if (lane % (32 / WIDTH) == 0 && place < LENGTH)
+                parts[(pair * WARPS + warp) * LENGTH + place] = held[0];
+        }
+"""
+
 _SUM_BLOCK = """
 #if defined(__CUDA_ARCH__)
     __shared__ float parts[32 * WARPS * LENGTH];
@@ -193,14 +206,7 @@ _SUM_BLOCK = """
         if (warp == 0)
             slots[lane] = pair;
     } else if (action == 1) {
-        float held[WIDTH];
-        #pragma unroll
-        for (int i = 0; i < WIDTH; ++i)
-            held[i] = i < LENGTH ? numbers[i] : 0.0f;
-        int place = 0;
-HALVINGS        if (lane % (32 / WIDTH) == 0 && place < LENGTH)
-            parts[(pair * WARPS + warp) * LENGTH + place] = held[0];
-        if (lane == 0)
+SUM_LANES        if (lane == 0)
             present[pair * WARPS + warp] = 1;
     } else {
         for (int i = threadIdx.x; i < 32 * LENGTH; i += 32 * WARPS) {
@@ -274,23 +280,34 @@ def sum_block_function(length: int, warps: int):
 
     - `BEGIN_SUMS`: every lane of the first warp names the slot of its pair, -1 for none.
     - `ADD_TO_SUMS`: the lanes of a warp bring their numbers for a pair. They halve what they hold in each of five
-      steps, as in a transpose, until it is one: 16 numbers take 16 exchanges and 4 take 6, where one sum after the
-      other would take five each.
+      steps, as in a transpose, until it is one: 32 numbers take 31 exchanges, 16 take 16 and 4 take 6, where one sum
+      after the other would take five each. So 19 numbers go as 16 and 4.
     - `END_SUMS`: the sums of the warps that brought some, in their order, go to the rows of the slots; zeros for none.
 
     All threads must wait for each other between the three. The order of additions is fixed.
     """
     Numbers = wp.types.vector(length=length, dtype=float)
-    width = next(n for n in (4, 8, 16, 32) if length <= n)
     # Written out step by step: NVRTC keeps an array that is indexed by a loop it does not unroll in slow local memory.
-    steps = [(16 >> i, width >> (i + 1)) for i in range(5)]
-    halvings = [
-        (_HALVE if half else _ADD_WHOLE).replace("STEP", str(step)).replace("HALF", str(half)) for step, half in steps
-    ]
-    snippet = _SUM_BLOCK.replace("HALVINGS", "".join(halvings)).replace("LENGTH", str(length))
-    snippet = snippet.replace("WARPS", str(warps)).replace("WIDTH", str(width))
+    parts = [(0, 16), (16, 4 if length <= 20 else 8)] if 16 < length <= 24 else [(0, _width_of(length))]
+    snippet = _SUM_BLOCK.replace("SUM_LANES", "".join(_sum_lanes(first, width) for first, width in parts))
+    snippet = snippet.replace("LENGTH", str(length)).replace("WARPS", str(warps))
 
     @wp.func_native(snippet)
     def sum_block(action: int, pair: int, numbers: Numbers, out_rows: wp.array[Numbers]): ...
 
     return sum_block
+
+
+def _width_of(length: int) -> int:
+    """Return how many numbers are halved together."""
+    return next(n for n in (4, 8, 16, 32) if length <= n)
+
+
+def _sum_lanes(first: int, width: int) -> str:
+    """Return the part of a snippet that sums ``width`` numbers from the first on over the lanes of a warp."""
+    steps = [(16 >> i, width >> (i + 1)) for i in range(5)]
+    halvings = [
+        (_HALVE if half else _ADD_WHOLE).replace("STEP", str(step)).replace("HALF", str(half)) for step, half in steps
+    ]
+    snippet = _SUM_LANES.replace("HALVINGS", "".join(halvings))
+    return snippet.replace("FIRST", str(first)).replace("WIDTH", str(width))

@@ -26,9 +26,10 @@ from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_below, pixel_place
 from beam_warp.kernels.raster.composite_adjoint_cuda import PART, THREADS, WARPS
-from beam_warp.kernels.raster.composite_cuda import CENTER, LANES, SHAPE, reaches
+from beam_warp.kernels.raster.composite_cuda import CENTER, LANES, SHAPE
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import alpha_of, behind, log_alpha_of, offset_from, whiten
+from beam_warp.kernels.raster.warp_lists_cuda import reaches
 
 
 @cache
@@ -82,7 +83,8 @@ def back_project_cuda_kernel(channel_count: int):
             if mine < end:
                 slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
-                frame.lists.summed[slot] = wp.uint8(1)
+                if slot >= 0:
+                    frame.lists.summed[slot] = wp.uint8(1)
                 if part == 0:
                     share_row(1, CENTER, lane, load_row(frame.splats.centers, splat))
                 if part == 1:

@@ -8,8 +8,8 @@ A tile lists a splat only if the ellipse where its alpha is 1/255 reaches it, no
 2025, Speedy-Splat).
 
 Pairs live in buffers of a fixed capacity, so that nothing waits for the device: what does not fit is left out, and the
-true number is kept for whoever asks. Each pair owns the place at which it was emitted (its slot), where the backward
-pass stores its gradient: the slots of a splat lie side by side.
+true number is kept for whoever asks. Each pair owns a place (its slot) among those of all pairs, where the backward
+pass stores its gradient: the slots of a splat lie side by side. Here it is where the pair was emitted.
 """
 
 import warp as wp
@@ -52,12 +52,14 @@ class TileLists:
 
     ranges: wp.array[wp.vec2i]  # of each tile, in ``splats``
     splats: wp.array[int]
-    slots: wp.array[int]  # where each pair was emitted
+    slots: wp.array[int]  # of each pair, -1 for none; on CUDA found on the way back
     # On CUDA only, where lists are sorted as far as they are drawn:
     order: wp.array[int]  # tiles in the order of drawing, counted from the band's first
-    entries: wp.array[wp.uint64]  # depth and slot of each pair, tile by tile
+    entries: wp.array[wp.uint64]  # depth, splat and rank of each pair, tile by tile
     parted: wp.array[wp.uint64]  # entries of long lists, parted by depth
-    owners: wp.array[int]  # the splat of each slot
+    ends: wp.array[int]  # end of what is sorted of each tile's list
+    ranks: wp.array[wp.uint16]  # of each pair among those of its splat, as far as there are bits
+    rank_bits: int
     summed: wp.array[wp.uint8]  # 1 where the way back has written the row of a slot
 
 
@@ -72,7 +74,7 @@ class SplatOrder:
 
 @wp.struct
 class PairList:
-    """The (tile, splat) pairs of a band: emitted splat by splat, then sorted by tile."""
+    """The (tile, splat) pairs of a band on the CPU: emitted splat by splat, then sorted by tile."""
 
     tiles: wp.array[int]  # counted from the band's first; sorted together with ``slots``
     slots: wp.array[int]  # where each pair was emitted

@@ -7,6 +7,7 @@ its own values; each block may be missing. Rows are cut into passes of at most 1
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launch_adjoint
+from beam_warp.kernels.common.row_loads import store_row
 from beam_warp.kernels.common.spherical_harmonics import seen_color
 from beam_warp.kernels.raster.project import CameraMove, RasterView
 
@@ -66,22 +67,40 @@ def normal_channels(blocks: ChannelBlocks) -> int:
     return wp.where(blocks.normals.shape[0] > 0, 3, 0)
 
 
-@wp.kernel(enable_backward=False)
-def gather_channels_kernel(first: int, blocks: ChannelBlocks, start: int, out_rows: wp.array2d[float]):
-    """Channels from ``start`` on, as many as a row is long; 0 beyond the last."""
-    splat = first + wp.tid()
+@wp.func
+def component(vector: wp.vec3, i: int) -> float:
+    """A component, selected: an index would put the vector into slow memory."""
+    return wp.where(i == 0, vector[0], wp.where(i == 1, vector[1], vector[2]))
+
+
+@wp.func
+def channel_of(blocks: ChannelBlocks, splat: int, channel: int) -> float:
+    """A channel of a splat; 0 beyond the last."""
     colors_end = color_channels(blocks)
     normals_end = colors_end + normal_channels(blocks)
-    for column in range(out_rows.shape[1]):
-        channel = start + column
-        value = float(0.0)
-        if channel < colors_end:
-            value = blocks.colors[splat][channel]
-        elif channel < normals_end:
-            value = blocks.normals[splat][channel - colors_end]
-        elif channel < normals_end + blocks.values.shape[1]:
-            value = blocks.values[splat % blocks.values.shape[0], channel - normals_end]
-        out_rows[splat, column] = value
+    value = float(0.0)
+    if channel < colors_end:
+        value = component(blocks.colors[splat], channel)
+    elif channel < normals_end:
+        value = component(blocks.normals[splat], channel - colors_end)
+    elif channel < normals_end + blocks.values.shape[1]:
+        value = blocks.values[splat % blocks.values.shape[0], channel - normals_end]
+    return value
+
+
+@wp.kernel(enable_backward=False)
+def gather_channels_kernel(first: int, blocks: ChannelBlocks, start: int, out_fours: wp.array2d[wp.vec4]):
+    """Channels from ``start`` on, as many as a row is long, four by four."""
+    splat = first + wp.tid()
+    for column in range(out_fours.shape[1]):
+        channel = start + 4 * column
+        row = wp.vec4(
+            channel_of(blocks, splat, channel),
+            channel_of(blocks, splat, channel + 1),
+            channel_of(blocks, splat, channel + 2),
+            channel_of(blocks, splat, channel + 3),
+        )
+        store_row(out_fours[splat], column, row)
 
 
 @wp.kernel(enable_backward=False)
@@ -141,9 +160,9 @@ def launch_evaluate_colors_adjoint(
         )
 
 
-def launch_gather_channels(blocks, start, rows, device):
-    """Write the channels from ``start`` on; ``rows`` are ``(splats, length)`` floats."""
-    launch(gather_channels_kernel, rows.shape[0], inputs=[blocks, start], outputs=[rows], device=device)
+def launch_gather_channels(blocks, start, fours, device):
+    """Write the channels from ``start`` on; ``fours`` are ``(splats, length / 4)`` vectors of four."""
+    launch(gather_channels_kernel, fours.shape[0], inputs=[blocks, start], outputs=[fours], device=device)
 
 
 def launch_scatter_channels(rows, columns, start, view_count, gradients, device):

@@ -19,10 +19,10 @@ import warp as wp
 
 from beam_warp.kernels.common.constants import ALPHA_MAX
 from beam_warp.kernels.raster.composite import Images, channel_vector
+from beam_warp.kernels.raster.project import Splat
 from beam_warp.kernels.raster.splat_rows import (
     SMALLEST_FACING,
     Sight,
-    SplatRow,
     bend_at,
     facing_at,
     limited_depth,
@@ -93,7 +93,7 @@ def depth_adjoint_function(exact: bool):
 
     @wp.func
     def depth_adjoint(
-        splat: SplatRow, near: float, offset: wp.vec2, limits: wp.vec2, nearness: float, z: float, v: float
+        splat: Splat, near: float, offset: wp.vec2, limits: wp.vec2, nearness: float, z: float, v: float
     ) -> wp.vec4:
         beyond = not (nearness > limits[0])
         before = (not beyond) and nearness >= limits[1]
@@ -133,7 +133,7 @@ def add_pixel_function(channel_count: int, exact: bool):
         total: Pair,
         state: PixelState,
         to_channels: Channels,
-        splat: SplatRow,
+        splat: Splat,
         row: Channels,
         near: float,
         sight: Sight,

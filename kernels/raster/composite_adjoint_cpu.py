@@ -14,8 +14,8 @@ from beam_warp.kernels.raster.composite_adjoint import (
     pixel_adjoint,
 )
 from beam_warp.kernels.raster.composite_cpu import MIN_TILES, columns_in, rows_in, tile_pixels
-from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, row_reach, sight_of, squared_extent
+from beam_warp.kernels.raster.project import LOG_CUT, Splat
+from beam_warp.kernels.raster.splat_rows import alpha_of, row_reach, sight_of, squared_extent
 
 
 @cache
@@ -54,7 +54,7 @@ def composite_adjoint_cpu_kernel(channel_count: int, exact: bool):
         for back in range(end - listed_range[0]):
             k = end - 1 - back
             splat = frame.lists.splats[k]
-            drawn = SplatRow()
+            drawn = Splat()
             drawn.center = frame.splats.centers[splat]
             drawn.shape = frame.splats.shapes[splat]
             drawn.slope = frame.splats.slopes[splat]

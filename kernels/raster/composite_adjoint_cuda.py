@@ -48,9 +48,10 @@ from beam_warp.kernels.raster.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, PART, SHAPE, SLOPE, STRIDE, reaches
-from beam_warp.kernels.raster.project import LOG_CUT
-from beam_warp.kernels.raster.splat_rows import SplatRow, alpha_of, sight_of
+from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, PART, SHAPE, SLOPE, STRIDE
+from beam_warp.kernels.raster.project import LOG_CUT, Splat
+from beam_warp.kernels.raster.splat_rows import alpha_of, sight_of
+from beam_warp.kernels.raster.warp_lists_cuda import reaches
 
 WARPS = 4
 """Warps of a block: a tile is 16 x 16 pixels."""
@@ -212,7 +213,8 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                 slot = frame.lists.slots[mine]
                 splat = frame.lists.splats[mine]
                 share_splat(part, lane, frame, channels, splat)
-                frame.lists.summed[slot] = wp.uint8(1)
+                if slot >= 0:
+                    frame.lists.summed[slot] = wp.uint8(1)
             sum_block(BEGIN_SUMS, slot, Pair(), out_pairs)
             wait_for_block()
             wanted = int(0)
@@ -225,7 +227,7 @@ def composite_adjoint_cuda_kernel(channel_count: int, exact: bool):
                 i = lowest_lane(waiting)
                 waiting = waiting & (waiting - 1)
                 k = end - 1 - i
-                drawn = SplatRow()
+                drawn = Splat()
                 drawn.center = shared_row(CENTER, i, channels)
                 drawn.shape = shared_row(SHAPE, i, channels)
                 above = sight_of(drawn.center, drawn.shape, upper.position)

@@ -28,6 +28,7 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launch_adjoint
+from beam_warp.kernels.common.row_loads import store_row
 
 LOG_CUT = wp.constant(7.994353436858858)
 """log2 255: an alpha below 1/255 does not reach an 8-bit image and is left out."""
@@ -82,6 +83,17 @@ class Splats:
     normals: wp.array[wp.vec3]  # unit, in the world, towards the camera: of the surface of largest response; or none
 
 
+@wp.struct
+class Splat:
+    """One of `Splats`."""
+
+    center: wp.vec4
+    shape: wp.vec4
+    slope: wp.vec4
+    bend: float
+    normal: wp.vec3
+
+
 CameraMove = wp.types.vector(length=12, dtype=float)
 """A small change of a camera: turn [rad] and shift [m] in its own axes, after which a point p in them is at
 p + turn x p + shift; added focal lengths and principal point [pixel]; radial terms k1 and k2 of a lens, with which the
@@ -105,11 +117,11 @@ def lens_jacobian(u: float, v: float, move: CameraMove) -> wp.mat22:
 
 @cache
 def project_function(with_camera: bool):
-    """Return the function that projects a Gaussian into a view, whose camera is moved where there is one."""
+    """Return the function that makes the splat of a Gaussian in a view, whose camera is moved where there is one."""
 
     @wp.func
     def project(
-        splat: int,
+        i: int,
         positions: wp.array[wp.vec3],
         orientations: wp.array[wp.quat],
         scales: wp.array[wp.vec3],
@@ -117,10 +129,9 @@ def project_function(with_camera: bool):
         view: RasterView,
         move: CameraMove,
         projection: Projection,
-        out_splats: Splats,
-    ):
-        out_splats.centers[splat] = wp.vec4(0.0, 0.0, -wp.inf, 0.0)
-        i = splat % positions.shape[0]
+    ) -> Splat:
+        splat = Splat()
+        splat.center = wp.vec4(0.0, 0.0, -wp.inf, 0.0)
         p = view.world_to_camera * (positions[i] - view.position)
         focal = view.focal
         middle = view.center
@@ -130,7 +141,7 @@ def project_function(with_camera: bool):
             middle = middle + wp.vec2(move[8], move[9])
         z = p[2]
         if not (z > projection.near):
-            return
+            return splat
         u = p[0] / z
         v = p[1] / z
         width = float(view.width)
@@ -143,7 +154,7 @@ def project_function(with_camera: bool):
         orientation = orientations[i]
         # Warp normalises a quaternion of NaN to 0, and turns 0 into a rotation.
         if not (wp.dot(orientation, orientation) > 0.0):
-            return
+            return splat
         axes = view.world_to_camera * wp.quat_to_matrix(wp.normalize(orientation))
         if wp.static(with_camera):
             axes = axes + wp.skew(wp.vec3(move[0], move[1], move[2])) * axes
@@ -190,7 +201,7 @@ def project_function(with_camera: bool):
         # overflow.
         faint = not (opacity * opacity * kept > 1.5378700499807768e-05)  # 1 / 255^2
         if faint or not (wp.isfinite(x) and wp.isfinite(y) and wp.isfinite(det) and det > 0.0):
-            return
+            return splat
         log_opacity = wp.log2(opacity) + 0.5 * wp.log2(kept)
         # Floored one by one: the adjoint of a maximum of equal numbers goes to one of them, and scales are often equal.
         thick = wp.vec3(wp.max(s[0], SMALLEST_SCALE), wp.max(s[1], SMALLEST_SCALE), wp.max(s[2], SMALLEST_SCALE))
@@ -207,19 +218,28 @@ def project_function(with_camera: bool):
         normal = -(axes * wp.cw_mul(inverse, a))
         if wp.static(with_camera):
             normal = normal - wp.cross(wp.vec3(move[0], move[1], move[2]), normal)
-        out_splats.centers[splat] = wp.vec4(x, y, log_opacity, z)
-        out_splats.shapes[splat] = wp.vec4(
-            WHITENING / wp.sqrt(xx), xy / xx, WHITENING * wp.sqrt(xx / det), DEPTH_REACH * largest
-        )
-        out_splats.slopes[splat] = wp.vec4(wp.dot(a, b0) / aa, wp.dot(a, b1) / aa, wp.dot(c0, c0), wp.dot(c0, c1))
-        out_splats.bends[splat] = wp.dot(c1, c1)
-        if out_splats.normals.shape[0] > 0:
-            out_splats.normals[splat] = wp.normalize(wp.transpose(view.world_to_camera) * normal)
+        splat.center = wp.vec4(x, y, log_opacity, z)
+        splat.shape = wp.vec4(WHITENING / wp.sqrt(xx), xy / xx, WHITENING * wp.sqrt(xx / det), DEPTH_REACH * largest)
+        splat.slope = wp.vec4(wp.dot(a, b0) / aa, wp.dot(a, b1) / aa, wp.dot(c0, c0), wp.dot(c0, c1))
+        splat.bend = wp.dot(c1, c1)
+        splat.normal = wp.normalize(wp.transpose(view.world_to_camera) * normal)
+        return splat
 
     return project
 
 
 project_still, project_moved = project_function(False), project_function(True)
+
+
+@wp.func
+def write_splat(i: int, splat: Splat, out_splats: Splats):
+    """Write all rows of a splat."""
+    store_row(out_splats.centers, i, splat.center)
+    store_row(out_splats.shapes, i, splat.shape)
+    store_row(out_splats.slopes, i, splat.slope)
+    out_splats.bends[i] = splat.bend
+    if out_splats.normals.shape[0] > 0:
+        out_splats.normals[i] = splat.normal
 
 
 @wp.kernel(launch_bounds=(256, 2))
@@ -233,9 +253,13 @@ def project_gaussians_kernel(
     projection: Projection,
     out_splats: Splats,
 ):
-    splat = first + wp.tid()
-    view = views[splat / positions.shape[0]]
-    project_still(splat, positions, orientations, scales, opacities, view, CameraMove(), projection, out_splats)
+    i = first + wp.tid()
+    count = positions.shape[0]
+    gaussian = i % count
+    splat = project_still(
+        gaussian, positions, orientations, scales, opacities, views[i / count], CameraMove(), projection
+    )
+    write_splat(i, splat, out_splats)
 
 
 @wp.kernel(launch_bounds=(256, 2))
@@ -250,9 +274,11 @@ def project_with_cameras_kernel(
     moves: wp.array[CameraMove],
     out_splats: Splats,
 ):
-    splat = first + wp.tid()
-    view = views[splat / positions.shape[0]]
-    project_moved(splat, positions, orientations, scales, opacities, view, moves[splat], projection, out_splats)
+    i = first + wp.tid()
+    count = positions.shape[0]
+    gaussian = i % count
+    splat = project_moved(gaussian, positions, orientations, scales, opacities, views[i / count], moves[i], projection)
+    write_splat(i, splat, out_splats)
 
 
 def launch_project(gaussians, views, projection, out_splats, device):

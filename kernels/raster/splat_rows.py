@@ -21,16 +21,6 @@ SMALLEST_FACING = wp.constant(1.0e-6)
 
 
 @wp.struct
-class SplatRow:
-    """One of the splats of `beam_warp.kernels.raster.project.Splats`."""
-
-    center: wp.vec4
-    shape: wp.vec4
-    slope: wp.vec4
-    bend: float
-
-
-@wp.struct
 class Sight:
     """A splat as one pixel sees it."""
 

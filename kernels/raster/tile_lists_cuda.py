@@ -1,10 +1,11 @@
 """Lists of the splats that each tile draws on CUDA: count, plan, emit; each tile's block then sorts its own list.
 
-A pair of tile and splat is an entry of its tile: the splat's depth and the pair's slot in one number. Slots follow the
-order of the splats, so that equal depths keep that order. A block sorts the nearest entries of its tile first, and as
-many more as its pixels look at: where the front hides the rest, most of a long list is never sorted.
+A pair of tile and splat is an entry of its tile: the splat's depth, its number, and the pair's rank among the splat's
+pairs in one, so that equal depths keep the order of the splats. A block sorts the nearest entries of its tile first,
+and as many more as its pixels look at: where the front hides the rest, most of a long list is never sorted.
 
-Entries are emitted by atomics, in any order; once they are sorted nothing of it is left.
+Entries are emitted by atomics, in any order; once they are sorted nothing of it is left. The slots of pairs follow from
+their ranks, when the way back asks for them.
 """
 
 from functools import cache
@@ -14,7 +15,7 @@ import warp as wp
 from beam_warp.kernels.common.launching import launch, launcher
 from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import Band, SplatOrder, TileLists, tile_box, tile_columns
-from beam_warp.kernels.raster.project import CameraMove, Projection, RasterView, Splats, project_still
+from beam_warp.kernels.raster.project import CameraMove, Projection, RasterView, Splats, project_still, write_splat
 
 # Pairs are counted by one kernel and emitted by another, which must find the same tiles to the last bit: a pair that is
 # counted and not emitted leaves what an earlier frame wrote. So each operation is rounded by itself: which products and
@@ -48,17 +49,22 @@ PLANNERS = 1024
 MOST_PLANS = 32
 """Most blocks that plan: each looks at all tiles."""
 
-NO_SLOT = wp.constant(wp.uint64(1 << 63))
-"""The bit of entries of pairs that have no slot; they come last."""
+NUMBER_BITS = 33
+"""Bits of an entry besides its depth, which is positive: as many as it takes for the splat's number, others for the
+rank."""
+
+MOST_RANK_BITS = 16
+"""Most bits of a rank."""
+
+SLOT_FINDERS = wp.constant(128)
+"""Threads that find the far slots of a tile's pairs."""
 
 
 @wp.func
-def count_entries(splat: int, splats: Splats, view: RasterView, band: Band, tallies: wp.array[int]) -> int:
+def count_entries(center: wp.vec4, shape: wp.vec4, view: RasterView, band: Band, tallies: wp.array[int]) -> int:
     """Number of a splat's pairs, each added to its tile's tally."""
-    center = splats.centers[splat]
     count = int(0)
     if center[2] > -wp.inf:
-        shape = splats.shapes[splat]
         box = tile_box(center, shape, view, band)
         for row in range(box[1], box[3]):
             columns = tile_columns(center, shape, view, box, row)
@@ -80,7 +86,9 @@ def count_entries_kernel(
     out_tallies: wp.array[int],
 ):
     splat = first + wp.tid()
-    out_counts[splat] = count_entries(splat, splats, views[splat / gaussian_count], band, out_tallies)
+    center = load_row(splats.centers, splat)
+    shape = load_row(splats.shapes, splat)
+    out_counts[splat] = count_entries(center, shape, views[splat / gaussian_count], band, out_tallies)
 
 
 @wp.kernel(launch_bounds=(SPLATS_A_BLOCK, 8))
@@ -98,10 +106,13 @@ def project_entries_kernel(
     out_tallies: wp.array[int],
 ):
     """`kernels.raster.project` and counting in one: a frame of few Gaussians takes as long as its launches."""
-    splat = first + wp.tid()
-    view = views[splat / positions.shape[0]]
-    project_still(splat, positions, orientations, scales, opacities, view, CameraMove(), projection, out_splats)
-    out_counts[splat] = count_entries(splat, out_splats, view, band, out_tallies)
+    i = first + wp.tid()
+    count = positions.shape[0]
+    gaussian = i % count
+    view = views[i / count]
+    splat = project_still(gaussian, positions, orientations, scales, opacities, view, CameraMove(), projection)
+    write_splat(i, splat, out_splats)
+    out_counts[i] = count_entries(splat.center, splat.shape, view, band, out_tallies)
 
 
 @wp.func_native(
@@ -123,19 +134,21 @@ def take_places(tallies: wp.array[int], tile: int, count: int) -> Places:
 
 
 @wp.func
-def write_entry(lists: TileLists, at: int, depth: wp.uint64, splat: int, slot: int, end: int):
-    """Write the pair of a tile and a splat, and who owns its slot; ``end`` is that of the splat's slots."""
-    has_slot = slot >= 0 and slot < end
-    if has_slot:
-        lists.owners[slot] = splat
+def last_rank(lists: TileLists) -> int:
+    """The rank that stands for all from there on, where a splat reaches more tiles than there are bits for."""
+    return (1 << lists.rank_bits) - 1
+
+
+@wp.func
+def write_entry(lists: TileLists, at: int, first: wp.uint64, rank: int):
+    """Write a pair of a splat, unless the tile has no room; ``first`` is the entry of the splat's first pair."""
     if at < lists.entries.shape[0]:
-        lists.entries[at] = wp.where(has_slot, depth | wp.uint64(slot), NO_SLOT | wp.uint64(at))
+        lists.entries[at] = first | wp.uint64(wp.min(rank, last_rank(lists)))
 
 
 @wp.kernel
 def emit_entries_kernel(
     first: int,
-    order: SplatOrder,
     splats: Splats,
     views: wp.array[RasterView],
     gaussian_count: int,
@@ -143,23 +156,20 @@ def emit_entries_kernel(
     tallies: wp.array[int],
     out_lists: TileLists,
 ):
-    """Entries beyond a tile's room are left out; a pair without a slot, beyond the capacity, leaves a last entry.
-
-    The numbers of pairs in the tallies go back to 0, for the next frame.
-    """
+    """Entries of tiles without room are left out. Numbers of pairs in the tallies go back to 0, for the next frame."""
     splat = first + wp.tid()
-    for tile in range(splat, band.end_tile - band.first_tile, order.counts.shape[0]):
+    for tile in range(splat, band.end_tile - band.first_tile, splats.centers.shape[0]):
         tallies[tile * SPREAD] = 0
-    count = order.counts[splat]
-    if count <= 0:
-        return
-    end = wp.min(order.ends[splat], out_lists.owners.shape[0])
-    slot = order.ends[splat] - count
     center = load_row(splats.centers, splat)
+    if not (center[2] > -wp.inf):
+        return
     shape = load_row(splats.shapes, splat)
     view = views[splat / gaussian_count]
     box = tile_box(center, shape, view, band)
-    depth = wp.uint64(wp.cast(center[3], int)) << wp.uint64(32)  # bits of a positive float sort like an integer
+    # The bits of a positive float sort like an integer.
+    entry = wp.uint64(wp.cast(center[3], int)) << wp.uint64(wp.static(NUMBER_BITS))
+    entry = entry | wp.uint64(splat) << wp.uint64(out_lists.rank_bits)
+    rank = int(0)
     # Two rows at a time, some columns of each: a thread does not wait for one atomic after the other.
     for row in range(box[1], box[3], 2):
         tile = view.first_tile - band.first_tile + row * view.columns
@@ -176,10 +186,57 @@ def emit_entries_kernel(
             for k in range(AHEAD):
                 at = column + k
                 if at < counts[0]:
-                    write_entry(out_lists, upper_places[k], depth, splat, slot + at, end)
+                    write_entry(out_lists, upper_places[k], entry, rank + at)
                 if at < counts[1]:
-                    write_entry(out_lists, lower_places[k], depth, splat, slot + counts[0] + at, end)
-        slot += counts[0] + counts[1]
+                    write_entry(out_lists, lower_places[k], entry, rank + counts[0] + at)
+        rank += counts[0] + counts[1]
+
+
+@wp.kernel
+def find_slots_kernel(first: int, order: SplatOrder, lists: TileLists, out_slots: wp.array[int]):
+    """What is not sorted gets slots of no meaning."""
+    place = first + wp.tid()
+    splat = lists.splats[place]
+    slot = order.ends[splat] - order.counts[splat] + int(lists.ranks[place])
+    out_slots[place] = slot_within(slot, out_slots.shape[0])
+
+
+@wp.func
+def slot_within(slot: int, capacity: int) -> int:
+    """A slot, or -1 beyond the capacity. Ends beyond the range of integers come out negative, and so do their slots."""
+    return wp.where(slot >= 0 and slot < capacity, slot, -1)
+
+
+@wp.kernel
+def find_far_slots_kernel(
+    first: int,
+    order: SplatOrder,
+    splats: Splats,
+    views: wp.array[RasterView],
+    tile_views: wp.array[int],
+    gaussian_count: int,
+    band: Band,
+    lists: TileLists,
+    out_slots: wp.array[int],
+):
+    """The pairs of a splat follow one another as its tiles do, row by row."""
+    item = first + wp.tid()
+    listed = item / SLOT_FINDERS
+    tile = band.first_tile + listed
+    view = views[tile_views[tile]]
+    own_row = (tile - view.first_tile) / view.columns
+    own_column = (tile - view.first_tile) % view.columns
+    for i in range(lists.ranges[listed][0] + item % SLOT_FINDERS, lists.ends[listed], SLOT_FINDERS):
+        if int(lists.ranks[i]) == last_rank(lists):
+            splat = lists.splats[i]
+            center = load_row(splats.centers, splat)
+            shape = load_row(splats.shapes, splat)
+            box = tile_box(center, shape, view, band)
+            rank = own_column - tile_columns(center, shape, view, box, own_row)[0]
+            for row in range(box[1], own_row):
+                columns = tile_columns(center, shape, view, box, row)
+                rank += columns[1] - columns[0]
+            out_slots[i] = slot_within(order.ends[splat] - order.counts[splat] + rank, out_slots.shape[0])
 
 
 _PLAN_TILES = """
@@ -252,6 +309,8 @@ _PLAN_TILES = """
         }
         before += sum_of_warps(PLANNERS / 32);
     }
+    if (end == tile_count && thread == 0)
+        total.data[0] = (int)min(before & (((Sum)1 << 40) - 1), (Sum)0x7fffffff);
 #endif
 """
 
@@ -267,11 +326,13 @@ def plan_tiles(
     capacity: int,
     ranges: wp.array[wp.vec2i],
     order: wp.array[int],
+    total: wp.array[int],
 ):
     """Places of the tiles' lists, one after the other, and the order in which tiles are drawn; by blocks.
 
     A block plans ``own_count`` tiles. What begins last should not take longest: long lists lie where a surface is seen
-    edge on. Tiles whose lists do not fit have none. Tallies are told where entries begin.
+    edge on. Tiles whose lists do not fit have none. Tallies are told where entries begin. The total of all pairs is
+    limited to the range of integers.
     """
     ...
 
@@ -285,8 +346,9 @@ def plan_tiles_kernel(
     capacity: int,
     out_ranges: wp.array[wp.vec2i],
     out_order: wp.array[int],
+    out_total: wp.array[int],
 ):
-    plan_tiles(tallies, tile_count, own_count, capacity, out_ranges, out_order)
+    plan_tiles(tallies, tile_count, own_count, capacity, out_ranges, out_order, out_total)
 
 
 _SORT_ENTRIES = """
@@ -352,9 +414,9 @@ _SORT_ENTRIES = """
         return sum - own;
     };
     const auto write = [&](int place, Entry entry) {
-        const int slot = (long long)entry < 0 ? -1 : (int)entry;
-        slots.data[listed + place] = slot;
-        splats.data[listed + place] = slot < 0 ? -1 : owners.data[slot];
+        const Entry number = entry & (((Entry)1 << NUMBER_BITS) - 1);
+        splats.data[listed + place] = (int)(number >> rank_bits);
+        ranks.data[listed + place] = (unsigned short)(number & ((1u << rank_bits) - 1));
     };
     const int length = end - begin;
     if (length <= FEW) {
@@ -453,18 +515,19 @@ _SORT_ENTRIES = """
 @cache
 def sort_entries_function(threads: int):
     """Return the function with which a block of so many threads, a power of two, sorts a tile's list part by part."""
-    snippet = _SORT_ENTRIES.replace("THREADS", str(threads)).replace("BITS", str(threads.bit_length() - 1))
+    snippet = _SORT_ENTRIES.replace("NUMBER_BITS", str(NUMBER_BITS))
+    snippet = snippet.replace("THREADS", str(threads)).replace("BITS", str(threads.bit_length() - 1))
 
     @wp.func_native(snippet.replace("SORTED", str(SORTED)).replace("FEW", str(FEW)))
     def sort_entries(
         entries: wp.array[wp.uint64],
-        owners: wp.array[int],
         begin: int,
         listed: int,
         end: int,
         parted: wp.array[wp.uint64],
         splats: wp.array[int],
-        slots: wp.array[int],
+        ranks: wp.array[wp.uint16],
+        rank_bits: int,
     ) -> int:
         """List the next entries of a tile in order, at most `SORTED`, after those ``listed``; return the new end.
 
@@ -496,23 +559,44 @@ def launch_project_entries(gaussians, views, projection, band, splats, counts, t
     )
 
 
-def launch_plan_tiles(tallies, tile_count, capacity, lists, device):
-    """Give every tile of a band its room and its turn."""
+def launch_plan_tiles(tallies, tile_count, capacity, lists, total, device):
+    """Give every tile of a band its room and its turn, and write the number of all pairs."""
     blocks = min(-(-tile_count // PLANNERS), MOST_PLANS)
-    inputs, outputs = [tallies, tile_count, -(-tile_count // max(blocks, 1)), capacity], [lists.ranges, lists.order]
+    inputs = [tallies, tile_count, -(-tile_count // max(blocks, 1)), capacity]
+    outputs = [lists.ranges, lists.order, total]
     count = blocks * PLANNERS
     launch(plan_tiles_kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=PLANNERS)
 
 
-def launch_emit_entries(order, splats, views, gaussian_count, band, tallies, lists, device):
-    """Write the entries of all tiles of a band, and the owner of every slot."""
-    inputs = [order, splats, views, gaussian_count, band, tallies]
+def launch_emit_entries(splats, views, gaussian_count, band, tallies, lists, device):
+    """Write the entries of all tiles of a band."""
     launch(
         emit_entries_kernel,
         len(splats.centers),
-        inputs=inputs,
+        inputs=[splats, views, gaussian_count, band, tallies],
         outputs=[lists],
         device=device,
         block_dim=SPLATS_A_BLOCK,
         in_order=True,
+    )
+
+
+def rank_bits(splat_count):
+    """Return how many bits of an entry are left for a rank, where there are so many splats."""
+    return min(NUMBER_BITS - max(splat_count - 1, 1).bit_length(), MOST_RANK_BITS)
+
+
+launch_find_slots = launcher(find_slots_kernel)
+"""Write the slots of all pairs whose ranks are known."""
+
+
+def launch_find_far_slots(order, splats, views, tile_views, gaussian_count, band, lists, device):
+    """Write the slots of those pairs whose rank says too little, among what is sorted of all lists of a band."""
+    launch(
+        find_far_slots_kernel,
+        (band.end_tile - band.first_tile) * int(SLOT_FINDERS),
+        inputs=[order, splats, views, tile_views, gaussian_count, band, lists],
+        outputs=[lists.slots],
+        device=device,
+        block_dim=int(SLOT_FINDERS),
     )

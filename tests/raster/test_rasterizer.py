@@ -244,6 +244,20 @@ def test_large_images_have_the_bits_of_small_ones(device, rng, monkeypatch, dept
     assert_same(*found)
 
 
+def test_splats_that_reach_very_many_tiles(device, made, values):
+    """Ranks of pairs beyond what an entry has bits for: gradients on CUDA are those on the CPU."""
+    scales = made.scales.copy()
+    scales[::20] *= 30.0
+    large, camera = made.with_arrays(scales=scales), around(230, 170)
+    drawers = [drawn(large, [camera], target, values)[0] for target in ("cpu", device)]
+    for drawer in drawers:
+        filled(np.random.default_rng(1), drawer)
+    one, other = (state(drawer) for drawer in drawers)
+    assert drawers[0].pair_count() > 10 * 100
+    for i in range(5, len(one)):
+        assert np.linalg.norm(one[i] - other[i]) <= 1e-5 * np.linalg.norm(one[i])
+
+
 @pytest.mark.parametrize("limit", [2**24, 300])
 def test_redraw_follows_contents_and_cameras(device, rng, made, values, monkeypatch, limit):
     """Also where there are bands."""

@@ -3,9 +3,10 @@
 import numpy as np
 import warp as wp
 
-from beam_warp.kernels.raster.composite_cuda import PART, reaches
+from beam_warp.kernels.raster.composite_cuda import PART
 from beam_warp.kernels.raster.project import LOG_CUT, WHITENING
 from beam_warp.kernels.raster.splat_rows import log_alpha_of, offset_from, whiten
+from beam_warp.kernels.raster.warp_lists_cuda import reaches
 
 COUNT = 200_000
 

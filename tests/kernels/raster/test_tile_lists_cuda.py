@@ -1,4 +1,4 @@
-"""Every tile's list has its room and its turn, and is sorted by depth and slot, piece by piece."""
+"""Every tile's list has its room and its turn, is sorted by depth and splat, piece by piece, and finds its slots."""
 
 from functools import cache
 
@@ -11,11 +11,15 @@ from beam_warp.kernels.raster.project import LOG_CUT, Projection, RasterView, Sp
 from beam_warp.kernels.raster.splat_rows import EXTENT_MARGIN, RELATIVE_MARGIN
 from beam_warp.kernels.raster.tile_lists_cuda import (
     NEXT_PLACE,
+    NUMBER_BITS,
     SORTED,
     SPREAD,
     launch_emit_entries,
+    launch_find_far_slots,
+    launch_find_slots,
     launch_plan_tiles,
     launch_project_entries,
+    rank_bits,
     sort_entries_function,
 )
 from beam_warp.raster.layout import ViewLayout
@@ -35,18 +39,17 @@ def sort_all_kernel(threads):
     @wp.kernel(enable_backward=False, module="unique")
     def kernel(
         entries: wp.array[wp.uint64],
-        owners: wp.array[int],
         begin: int,
         end: int,
         parted: wp.array[wp.uint64],
         out_splats: wp.array[int],
-        out_slots: wp.array[int],
+        out_ranks: wp.array[wp.uint16],
         out_most: wp.array[int],
     ):
         thread = wp.tid()
         listed = wp.int32(begin)
         while listed < end:
-            further = sort_entries(entries, owners, begin, listed, end, parted, out_splats, out_slots)
+            further = sort_entries(entries, begin, listed, end, parted, out_splats, out_ranks, 7)
             if thread == 0:
                 wp.atomic_max(out_most, 0, further - listed)
             listed = further
@@ -55,36 +58,33 @@ def sort_all_kernel(threads):
 
 
 @pytest.mark.parametrize("threads", [128, 256])
-@pytest.mark.parametrize("kind", ["even", "equal", "crowded", "without slots"])
+@pytest.mark.parametrize("kind", ["even", "equal", "crowded"])
 @pytest.mark.parametrize("count", [1, 31, 33, 256, SORTED, SORTED + 1, 5000, 70_000])
 def test_entries_are_sorted(rng, count, kind, threads):
-    """Lists beyond what shared memory holds, too; equal depths by slot; entries without a slot last."""
+    """Lists beyond what shared memory holds, too; equal depths by splat."""
     begin, capacity = 5, count + 8
     depths = ONE + rng.integers(0, 2**22, count)
     if kind == "equal":
         depths[:] = ONE
     if kind == "crowded":
         depths = np.where(rng.uniform(size=count) < 0.9, ONE + 2**20 + rng.integers(0, 3, count), depths)
-    slots = rng.permutation(count)
-    entries = depths.astype(np.uint64) << np.uint64(32) | slots.astype(np.uint64)
-    if kind == "without slots":
-        lost = rng.uniform(size=count) < 0.5
-        entries[lost] = np.uint64(2**63) + np.flatnonzero(lost).astype(np.uint64)
-    owners = rng.integers(0, 1000, capacity)
+    numbers = 128 * rng.permutation(count) + rng.integers(0, 128, count)
+    entries = (depths << NUMBER_BITS | numbers).astype(np.uint64)
     given = wp.array(
         np.r_[np.zeros(begin, np.uint64), entries, np.zeros(3, np.uint64)], dtype=wp.uint64, device="cuda:0"
     )
-    found = [wp.full(capacity, -7, dtype=int, device="cuda:0") for _ in range(2)]
+    found = [wp.full(capacity, 77, dtype=dtype, device="cuda:0") for dtype in (int, wp.uint16)]
     most = wp.zeros(1, dtype=int, device="cuda:0")
-    inputs = [given, wp.array(owners, dtype=int, device="cuda:0"), begin, begin + count, wp.zeros_like(given)]
+    inputs = [given, begin, begin + count, wp.zeros_like(given)]
     kernel, outputs = sort_all_kernel(threads), [*found, most]
     wp.launch(kernel, threads, inputs=inputs, outputs=outputs, device="cuda:0", block_dim=threads)
-    ordered = np.sort(entries)
-    expected = np.where(ordered >= 2**63, -1, (ordered & np.uint64(0xFFFFFFFF)).astype(np.int64))
-    splats, listed = (array.numpy()[begin : begin + count] for array in found)
-    np.testing.assert_array_equal(listed, expected)
-    np.testing.assert_array_equal(splats, np.where(expected < 0, -1, owners[expected]))
-    assert all((array.numpy()[[*range(begin), *range(begin + count, capacity)]] == -7).all() for array in found)
+    splats, ranks = (array.numpy() for array in found)
+    ordered = np.sort(entries).astype(np.int64) % 2**NUMBER_BITS
+    np.testing.assert_array_equal(splats[begin : begin + count], ordered // 128)
+    np.testing.assert_array_equal(ranks[begin : begin + count], ordered % 128)
+    outside = [*range(begin), *range(begin + count, capacity)]
+    assert (splats[outside] == 77).all()
+    assert (ranks[outside] == 77).all()
     assert most.numpy()[0] <= SORTED
 
 
@@ -97,9 +97,10 @@ def test_tiles_have_their_room_and_their_turn(rng, tile_count, room):
     lists = TileLists()
     lists.ranges = wp.zeros(tile_count, dtype=wp.vec2i, device="cuda:0")
     lists.order = wp.zeros(tile_count, dtype=int, device="cuda:0")
-    tallies = np.repeat(lengths, SPREAD)
-    launch_plan_tiles(wp.array(tallies, dtype=int, device="cuda:0"), tile_count, capacity, lists, "cuda:0")
+    tallies, total = (wp.array(numbers, dtype=int, device="cuda:0") for numbers in (np.repeat(lengths, SPREAD), [-1]))
+    launch_plan_tiles(tallies, tile_count, capacity, lists, total, "cuda:0")
     ends = np.cumsum(lengths)
+    assert total.numpy()[0] == ends[-1]
     fits = ends <= capacity
     expected = np.where(fits, [ends - lengths, ends], capacity).T
     np.testing.assert_array_equal(lists.ranges.numpy(), expected)
@@ -148,18 +149,35 @@ def test_every_pair_that_is_counted_is_emitted(rng):
         positions += np.where(np.isfinite(shift), shift, 0.0)[:, None] * axes
     wp.utils.array_scan(order.counts, order.ends, inclusive=True)
     pairs = int(order.ends.numpy()[-1])
-    lists.ranges, lists.order = zeros(tile_count, wp.vec2i), zeros(tile_count)
-    lists.owners, lists.entries = zeros(pairs), zeros(pairs, wp.uint64)
+    lists.ranges, lists.order, lists.ends = zeros(tile_count, wp.vec2i), zeros(tile_count), zeros(tile_count)
+    lists.entries, lists.rank_bits, total = zeros(pairs, wp.uint64), rank_bits(count), zeros(1)
     counted = tallies.numpy()[:: int(SPREAD)]
-    launch_plan_tiles(tallies, tile_count, pairs, lists, device)
-    launch_emit_entries(order, splats, views, count, band, tallies, lists, device)
+    launch_plan_tiles(tallies, tile_count, pairs, lists, total, device)
+    launch_emit_entries(splats, views, count, band, tallies, lists, device)
     left, places = tallies.numpy().reshape(tile_count, -1)[:, [0, NEXT_PLACE]].T
     assert pairs > 2 * count
     assert np.median(np.abs(shift)) < 1e-5
     assert not left.any()
     np.testing.assert_array_equal(places, np.cumsum(counted))  # each list ends where the next one begins
-    assert (lists.entries.numpy() != 0).all()
-    np.testing.assert_array_equal(lists.owners.numpy(), np.repeat(np.arange(count), order.counts.numpy()))
+    listed, ranks = np.divmod(lists.entries.numpy().astype(np.int64) % 2**NUMBER_BITS, 2**lists.rank_bits)
+    owners = np.repeat(np.arange(count), order.counts.numpy())
+    np.testing.assert_array_equal(np.sort(listed), owners)
+    # Every pair has a slot of its own, among those of its splat; beyond the capacity it has none.
+    tile_views = wp.array(layout.tile_views, dtype=int, device=device)
+    last = 2**lists.rank_bits - 1
+    for capacity, known in ((pairs, ranks), (pairs, np.full(pairs, last)), (pairs // 2, ranks)):
+        lists.ranks = wp.array(known, dtype=wp.uint16, device=device)
+        lists.splats = wp.array(listed[:capacity], dtype=int, device=device)
+        lists.slots = zeros(capacity)
+        lists.ends.assign(np.minimum(np.cumsum(counted), capacity))
+        launch_find_slots(capacity, order, lists, lists.slots, device)
+        if known is not ranks:
+            launch_find_far_slots(order, splats, views, tile_views, count, band, lists, device)
+        slots = lists.slots.numpy()
+        has_slot = slots >= 0
+        np.testing.assert_array_equal(owners[slots[has_slot]], listed[:capacity][has_slot])
+        assert len(np.unique(slots[has_slot])) == has_slot.sum()
+        assert has_slot.all() == (capacity == pairs)
 
 
 def _left_end(shapes, squared, top, bottom):
