@@ -15,7 +15,6 @@ pass stores its gradient: the slots of a splat lie side by side. Here it is wher
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
-from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.project import RasterView, Splats
 from beam_warp.kernels.raster.splat_rows import (
     EXTENT_MARGIN,
@@ -26,6 +25,7 @@ from beam_warp.kernels.raster.splat_rows import (
     reach_rows,
     squared_extent,
 )
+from beam_warp.kernels.raster.strided_rows import load_row
 
 wp.set_module_options({"enable_backward": False})
 

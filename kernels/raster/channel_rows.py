@@ -7,9 +7,9 @@ its own values; each block may be missing. Rows are cut into passes of at most 1
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launch_adjoint
-from beam_warp.kernels.common.row_loads import store_row
 from beam_warp.kernels.common.spherical_harmonics import seen_color
 from beam_warp.kernels.raster.project import CameraMove, RasterView
+from beam_warp.kernels.raster.strided_rows import store_row
 
 
 @wp.struct

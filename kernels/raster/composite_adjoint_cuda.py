@@ -29,7 +29,6 @@ from beam_warp.kernels.common.lanes import (
     wait_for_block,
 )
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import (
     Checkpoints,
@@ -51,6 +50,7 @@ from beam_warp.kernels.raster.composite_adjoint import (
 from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, PART, SHAPE, SLOPE, STRIDE
 from beam_warp.kernels.raster.project import LOG_CUT, Splat
 from beam_warp.kernels.raster.splat_rows import alpha_of, sight_of
+from beam_warp.kernels.raster.strided_rows import load_row
 from beam_warp.kernels.raster.warp_lists_cuda import reaches
 
 WARPS = 4

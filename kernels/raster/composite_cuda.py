@@ -27,7 +27,6 @@ from beam_warp.kernels.common.lanes import (
     wait_for_warp,
 )
 from beam_warp.kernels.common.launching import launch
-from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import SIDE, TILE
 from beam_warp.kernels.raster.composite import (
     Checkpoints,
@@ -50,6 +49,7 @@ from beam_warp.kernels.raster.splat_rows import (
     offset_from,
     whiten,
 )
+from beam_warp.kernels.raster.strided_rows import load_row
 from beam_warp.kernels.raster.tile_lists_cuda import sort_entries_function
 from beam_warp.kernels.raster.warp_lists_cuda import LANES, box_of, warp_lists_functions
 

@@ -28,7 +28,7 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launch_adjoint
-from beam_warp.kernels.common.row_loads import store_row
+from beam_warp.kernels.raster.strided_rows import store_row
 
 LOG_CUT = wp.constant(7.994353436858858)
 """log2 255: an alpha below 1/255 does not reach an 8-bit image and is left out."""

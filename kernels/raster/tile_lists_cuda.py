@@ -13,9 +13,9 @@ from functools import cache
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
-from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import Band, SplatOrder, TileLists, tile_box, tile_columns
 from beam_warp.kernels.raster.project import CameraMove, Projection, RasterView, Splats, project_still, write_splat
+from beam_warp.kernels.raster.strided_rows import load_row
 
 # Pairs are counted by one kernel and emitted by another, which must find the same tiles to the last bit: a pair that is
 # counted and not emitted leaves what an earlier frame wrote. So each operation is rounded by itself: which products and

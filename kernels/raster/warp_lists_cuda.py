@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from beam_warp.kernels.common.lanes import ballot, bits_below_lane, count_bits
-from beam_warp.kernels.common.row_loads import load_row
 from beam_warp.kernels.raster.bin_tiles import TileLists
 from beam_warp.kernels.raster.project import Splats
 from beam_warp.kernels.raster.splat_rows import EXTENT_MARGIN, RELATIVE_MARGIN, quick_divide, squared_extent, whiten
+from beam_warp.kernels.raster.strided_rows import load_row
 from beam_warp.kernels.raster.tile_lists_cuda import SORTED
 
 LANES = wp.constant(32)
