@@ -97,19 +97,6 @@ def looks(sums: PixelSums) -> int:
 
 
 @wp.func
-def add_splat(sums: PixelSums, seen: bool, alpha: float, weight: float, z: float, at: int) -> PixelSums:
-    """A pixel after the splat at a place in the lists; no branch, see where it is called."""
-    sums.depth += z * weight
-    sums.weight += weight
-    sums.last = wp.where(seen, at, sums.last)
-    nearer = seen and sums.transmittance > MEDIAN
-    sums.median_depth = wp.where(nearer, z, sums.median_depth)
-    sums.median = wp.where(nearer, at, sums.median)
-    sums.transmittance = behind(sums.transmittance, alpha)
-    return sums
-
-
-@wp.func
 def end_pixel(place: PixelPlace, sums: PixelSums, frame: RasterFrame, begin: int, out_images: Images):
     """Write a pixel's images but for its channels; ``begin`` is where its tile's list begins."""
     pixel = place.index
@@ -129,6 +116,30 @@ def end_pixel(place: PixelPlace, sums: PixelSums, frame: RasterFrame, begin: int
 
 
 @cache
+def add_splat_function(channel_count: int, colored: bool):
+    """Return the function that gives a pixel, and its channels, after the splat at a place in the lists."""
+    Channels = channel_vector(channel_count)
+
+    @wp.func
+    def add_splat(sums: PixelSums, total: Channels, seen: bool, log_alpha: float, z: float, row: Channels, at: int):
+        # No branch: it would cost a selection for every variable that it changes.
+        alpha = wp.where(seen, alpha_of(log_alpha), 0.0)
+        weight = alpha * sums.transmittance
+        if wp.static(colored):
+            total += row * weight
+        sums.depth += z * weight
+        sums.weight += weight
+        sums.last = wp.where(seen, at, sums.last)
+        nearer = seen and sums.transmittance > MEDIAN
+        sums.median_depth = wp.where(nearer, z, sums.median_depth)
+        sums.median = wp.where(nearer, at, sums.median)
+        sums.transmittance = behind(sums.transmittance, alpha)
+        return sums, total
+
+    return add_splat
+
+
+@cache
 def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True, pixels: int = 2):
     """Return the kernel that composites ``channel_count`` channels, or none, for ``pixels`` an item, one or two.
 
@@ -139,6 +150,7 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True,
     threads = TILE * TILE // pixels
     share, shared_row = share_splats_functions(Channels, 4 if exact else 3, threads)
     sort_entries = sort_entries_function(threads)
+    add_splat = add_splat_function(channel_count, colored)
     rows = LANES // PART
     both = pixels == 2
     put_box, mark, queue, queued, splat_of = warp_lists_functions(threads)
@@ -279,20 +291,12 @@ def composite_cuda_kernel(channel_count: int, exact: bool, colored: bool = True,
                     while draws_upper != 0:
                         draws_upper = 0
                         z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], above))
-                        alpha = wp.where(in_upper, alpha_of(log_above), 0.0)
-                        weight = alpha * upper.transmittance
-                        if wp.static(colored):
-                            upper_total += row_of * weight
-                        upper = add_splat(upper, in_upper, alpha, weight, z, at)
+                        upper, upper_total = add_splat(upper, upper_total, in_upper, log_above, z, row_of, at)
                     if wp.static(both):
                         while draws_lower != 0:
                             draws_lower = 0
                             z = limited_depth(drawn[3], limits, nearness_at(slope, bounds[0], below))
-                            alpha = wp.where(in_lower, alpha_of(log_below), 0.0)
-                            weight = alpha * lower.transmittance
-                            if wp.static(colored):
-                                lower_total += row_of * weight
-                            lower = add_splat(lower, in_lower, alpha, weight, z, at)
+                            lower, lower_total = add_splat(lower, lower_total, in_lower, log_below, z, row_of, at)
             begin = sorted_end
             if any_of_block(wp.max(looks(upper), looks(lower))) == 0:
                 begin = listed_range[1]
