@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import warp as wp
 
 from beam_warp.kernels.raster.back_projection_cpu import launch_back_project_cpu
@@ -18,6 +21,9 @@ from beam_warp.raster.buffers import FrameBuffers
 from beam_warp.raster.forward import find_slots
 from beam_warp.raster.layout import Rows, channel_rows
 from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianArrays, GaussianGradients, RasterImages
+
+ALIGNMENT = 16
+"""Floats in 64 bytes: arrays begin at multiples of that."""
 
 
 class BackwardBuffers:
@@ -37,11 +43,20 @@ class BackwardBuffers:
             flat = [wp.zeros(pixel_count, dtype=float) for _ in range(3)]
             self.images = RasterImages(tuple(rows.matrix for rows in self._adjoints), *flat)
             lengths = [pair_length(rows.length, drawn.exact) for rows in self._adjoints]
-            self._sums = [wp.zeros((splat_count, length), dtype=float) for length in lengths]
             self._splats = drawn.zero_splats()
             self._blocks = drawn.zero_blocks(len(drawn.channels.values), self._splats.normals)
-            geometry = [wp.zeros(count, dtype=dtype) for dtype in (wp.vec3, wp.quat, wp.vec3, float)]
-            self.gaussians = GaussianGradients(*geometry, values=self._blocks.values if drawn.channels.values else None)
+            widths = [(count, width) for width in (3, 4, 3, 1)] + [(splat_count, width) for width in (4, 4, 4, 1)]
+            self._summed, parts = _zeros_in_one([*widths, *((splat_count, length) for length in lengths)])
+            positions, orientations, scales, opacities, centers, shapes, slopes, bends, *self._sums = parts
+            self.gaussians = GaussianGradients(
+                positions.view(wp.vec3),
+                orientations.view(wp.quat),
+                scales.view(wp.vec3),
+                opacities.flatten(),
+                values=self._blocks.values if drawn.channels.values else None,
+            )
+            self._splats.centers, self._splats.shapes = centers.view(wp.vec4), shapes.view(wp.vec4)
+            self._splats.slopes, self._splats.bends = slopes.view(wp.vec4), bends.flatten()
             # Their own: the adjoint projects anew and writes them, with other roundings than those that were drawn.
             self._tracked = _with_gradients(drawn.zero_splats(), self._splats)
         self._cameras: CameraBuffers | None = None
@@ -52,11 +67,9 @@ class BackwardBuffers:
             held = self.gaussians.radiance
             if held is None or held.shape != gaussians.radiance.shape:
                 self.gaussians = self.gaussians._replace(radiance=wp.zeros_like(gaussians.radiance))
-        splats = self._splats
-        summed = (*self.gaussians[:4], self.gaussians.radiance, *self._sums)
-        for array in (*summed, splats.centers, splats.shapes, splats.slopes, splats.bends):
-            if array is not None:
-                array.zero_()
+        self._summed.zero_()
+        if self.gaussians.radiance is not None:
+            self.gaussians.radiance.zero_()
 
     def add_band(self) -> None:
         """Add the part of the band listed last to the gradients of splats and of their rows."""
@@ -134,6 +147,17 @@ def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> N
     drawn.begin_sums()
     back_project(drawn.frame, drawn.drawn, Rows.of(pixels).vectors, pairs.vectors, drawn.device)
     launch_sum_pairs(out.size, pairs.matrix, drawn.frame.lists, drawn.order, out, drawn.device)
+
+
+def _zeros_in_one(shapes: Sequence[tuple[int, int]]) -> tuple[wp.array, list[wp.array]]:
+    """Allocate matrices of floats on the current device in one array, which one launch clears, each aligned to it."""
+    ends = np.cumsum([-(-rows * columns // ALIGNMENT) * ALIGNMENT for rows, columns in shapes]).tolist()
+    whole = wp.zeros(ends[-1], dtype=float)
+    parts = []
+    for (rows, columns), start in zip(shapes, [0, *ends], strict=False):
+        part = whole[start : start + rows * columns].reshape((rows, columns)) if rows else wp.zeros((0, columns))
+        parts.append(part)
+    return whole, parts
 
 
 def _with_gradients(splats: Splats, gradients: Splats) -> Splats:
