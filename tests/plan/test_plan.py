@@ -421,15 +421,19 @@ if __name__ == "__main__" or sys.argv[2] == "text":
 """
 
 
-@pytest.mark.parametrize(("held", "runs"), [("text", 1), ("own", 3)])
-def test_processes_run_a_script_again_only_for_what_is_defined_in_it(tmp_path, held, runs):
-    """The first has no guard, as scripts of users have none; works of the second hold a class of its own."""
+@pytest.mark.parametrize("held", ["text", "own"])
+def test_processes_run_a_script_again_only_for_what_is_defined_in_it(tmp_path, held):
+    """The first has no guard, as scripts of users have none; works of the second hold a class of its own.
+
+    One process may have done all before the other has run the script.
+    """
     script = tmp_path / "script.py"
     script.write_text(BARE, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, script, tmp_path, held], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "runs.txt").read_text() == runs * "x"
+    runs = (tmp_path / "runs.txt").read_text()
+    assert runs == "x" if held == "text" else len(runs) in (2, 3)
     assert len(outputs(tmp_path)) == 8
 
 
