@@ -15,10 +15,10 @@ from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
 from beam_warp.kernels.raster.composite_adjoint import MOMENTS, Adjoints, pair_length
 from beam_warp.kernels.raster.composite_adjoint_cpu import launch_composite_adjoint_cpu
 from beam_warp.kernels.raster.composite_adjoint_cuda import launch_composite_adjoint_cuda
+from beam_warp.kernels.raster.pair_slots_cuda import launch_find_far_slots, launch_find_slots
 from beam_warp.kernels.raster.pair_sums import launch_resolve_sums, launch_sum_pairs
 from beam_warp.kernels.raster.project import CameraMove, Splats, launch_project_adjoint
 from beam_warp.raster.buffers import FrameBuffers
-from beam_warp.raster.forward import find_slots
 from beam_warp.raster.layout import Rows, channel_rows
 from beam_warp.raster.records import CAMERA_PARAMETERS, GaussianArrays, GaussianGradients, RasterImages
 
@@ -76,7 +76,7 @@ class BackwardBuffers:
         drawn = self._drawn
         if not drawn.pair_capacity:
             return
-        find_slots(drawn)
+        _find_slots(drawn)
         upstream = Adjoints()
         upstream.alpha, upstream.depth = self.images.alpha, self.images.depth
         upstream.median_depth = self.images.median_depth
@@ -142,11 +142,23 @@ def back_project_band(drawn: FrameBuffers, pixels: wp.array, out: wp.array) -> N
     if not drawn.pair_capacity:
         return
     back_project = launch_back_project_cuda if drawn.device.is_cuda else launch_back_project_cpu
-    find_slots(drawn)
+    _find_slots(drawn)
     pairs = drawn.pair_rows(pixels.shape[1])
     drawn.begin_sums()
     back_project(drawn.frame, drawn.drawn, Rows.of(pixels).vectors, pairs.vectors, drawn.device)
     launch_sum_pairs(out.size, pairs.matrix, drawn.frame.lists, drawn.order, out, drawn.device)
+
+
+def _find_slots(drawn: FrameBuffers) -> None:
+    """Give every pair of the band that was drawn last its slot, on CUDA: elsewhere pairs have them since emission."""
+    if not drawn.device.is_cuda:
+        return
+    order, frame, lists = drawn.order, drawn.frame, drawn.frame.lists
+    wp.utils.array_scan(order.counts, order.ends, inclusive=True)
+    launch_find_slots(drawn.pair_capacity, order, lists, lists.slots, drawn.device)
+    if drawn.may_lack_ranks:
+        views = (frame.views, frame.tile_views, frame.gaussian_count)
+        launch_find_far_slots(order, frame.splats, *views, frame.band, lists, drawn.device)
 
 
 def _zeros_in_one(shapes: Sequence[tuple[int, int]]) -> tuple[wp.array, list[wp.array]]:

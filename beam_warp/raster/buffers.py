@@ -213,14 +213,12 @@ class FrameBuffers:
 
         Reading 16 bytes of memory takes as long as reading 64. Rows of more than four channels stay by themselves.
         """
-        count = self.splat_count
-        self._records = wp.zeros((count, RECORD), dtype=float)
-        names, apart = ("centers", "shapes", "slopes"), self._records.strides[0]
-        for i, name in enumerate(names):
-            place = self._records.ptr + 16 * i
-            setattr(self.splats, name, wp.array(ptr=place, shape=count, strides=(apart,), dtype=wp.vec4))
+        records = wp.zeros((self.splat_count, RECORD), dtype=float)
+        centers, shapes, slopes, channels = (records[:, start : start + 4] for start in range(0, RECORD, 4))
+        self.splats.centers, self.splats.shapes = centers.view(wp.vec4), shapes.view(wp.vec4)
+        self.splats.slopes = slopes.view(wp.vec4)
         if [rows.length for rows in self.rows] == [4]:
-            self.rows = [Rows.of(self._records[:, 4 * len(names) :])]
+            self.rows = [Rows.of(channels)]
 
     def _allocate_images(self, images_of: FrameBuffers | None) -> None:
         """Allocate images, or take the first pixels of another frame's."""

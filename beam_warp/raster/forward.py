@@ -23,8 +23,6 @@ from beam_warp.kernels.raster.project import launch_project
 from beam_warp.kernels.raster.tile_lists_cuda import (
     launch_count_entries,
     launch_emit_entries,
-    launch_find_far_slots,
-    launch_find_slots,
     launch_plan_tiles,
     launch_project_entries,
 )
@@ -48,15 +46,13 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
 
     The tallies of tiles must be 0, as `list_pairs` leaves them.
     """
-    is_cuda, tiles = buffers.device.is_cuda, (0, int(buffers.layout.first_tiles[-1]))
+    tiles = (0, int(buffers.layout.first_tiles[-1]))
     inputs = (gaussians[:4], buffers.views, buffers.projection)
-    if is_cuda:
+    if buffers.device.is_cuda:  # every tile sorts its own list
         counted = buffers.order.counts, buffers.tallies
         launch_project_entries(*inputs, _begin_band(buffers, tiles), buffers.splats, *counted, buffers.device)
-    else:
-        launch_project(*inputs, buffers.splats, buffers.device)
-    if is_cuda:  # every tile sorts its own list
         return
+    launch_project(*inputs, buffers.splats, buffers.device)
     launch_key_splats(len(buffers.splats.centers), buffers.splats, buffers.keys, buffers.order.splats, buffers.device)
     if buffers.splat_count:
         wp.utils.radix_sort_pairs(buffers.keys, buffers.order.splats, buffers.splat_count)
@@ -64,17 +60,17 @@ def project(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
 
 
 def evaluate_colors(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
-    """Find the colour of every splat, and where its values are. Wait for it as for `gather_channels`, which follows."""
-    if buffers.channels.values:
-        buffers.blocks.values = gaussians.values
+    """Find the colour of every splat. Wait for it as for `gather_channels`, which follows."""
     if buffers.channels.colors:
         seen = (gaussians.positions, gaussians.radiance, buffers.views, buffers.blocks.colors)
         with buffers.beside(buffers.gathering):
             launch_evaluate_colors(*seen, buffers.device)
 
 
-def gather_channels(buffers: FrameBuffers) -> None:
+def gather_channels(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
     """Write every splat's row of channels; where there are none, rows stay 0. Wait for it before compositing."""
+    if buffers.channels.values:
+        buffers.blocks.values = gaussians.values
     with buffers.beside(buffers.gathering):
         for i, rows in enumerate(buffers.rows if buffers.channels.count else ()):
             launch_gather_channels(buffers.blocks, i * CHANNEL_COUNTS[-1], rows.fours, buffers.device)
@@ -122,7 +118,8 @@ def count_pairs(buffers: FrameBuffers, tiles: tuple[int, int]) -> None:
         launch_count_entries(buffers.splat_count, *inputs, buffers.tallies, buffers.device)
         return
     launch_count_pairs(order.splats, *inputs, buffers.device)
-    _sum_counts(buffers)
+    if buffers.splat_count:
+        wp.utils.array_scan(order.counts, order.ends, inclusive=True)
 
 
 def _begin_band(buffers: FrameBuffers, tiles: tuple[int, int]) -> Band:
@@ -131,12 +128,6 @@ def _begin_band(buffers: FrameBuffers, tiles: tuple[int, int]) -> Band:
     band.first_tile, band.end_tile = tiles
     buffers.frame.band = band
     return band
-
-
-def _sum_counts(buffers: FrameBuffers) -> None:
-    """Find where the pairs of every splat end."""
-    if buffers.splat_count:
-        wp.utils.array_scan(buffers.order.counts, buffers.order.ends, inclusive=True)
 
 
 def _plan_tiles(buffers: FrameBuffers) -> None:
@@ -174,18 +165,6 @@ def list_pairs(buffers: FrameBuffers) -> None:
     launch_emit_pairs(buffers.order, *inputs, pairs, buffers.device)
     wp.utils.radix_sort_pairs(pairs.tiles, pairs.slots, buffers.pair_capacity, end_bit=tile_count.bit_length())
     launch_find_ranges(pairs, tile_count, frame.lists, buffers.device)
-
-
-def find_slots(buffers: FrameBuffers) -> None:
-    """Give every pair of the band that was drawn last its slot, where it has none since it was listed: on CUDA."""
-    if not buffers.device.is_cuda:
-        return
-    _sum_counts(buffers)
-    frame = buffers.frame
-    launch_find_slots(buffers.pair_capacity, buffers.order, frame.lists, frame.lists.slots, buffers.device)
-    if buffers.may_lack_ranks:
-        views = (frame.views, frame.tile_views, frame.gaussian_count)
-        launch_find_far_slots(buffers.order, frame.splats, *views, frame.band, frame.lists, buffers.device)
 
 
 def composite(buffers: FrameBuffers, draw: Callable[..., None] | None = None) -> None:

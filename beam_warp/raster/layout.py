@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,31 +89,28 @@ class Rows:
     """Rows of floats of one length, read as vectors by kernels and as a matrix by everybody else.
 
     Attributes:
-        matrix: ``(N, K)`` float.
+        matrix: ``(N, K)`` float; rows are compact, and may lie apart.
         vectors: The same memory, ``(N,)`` vectors of K.
-        fours: The same memory, ``(N, K // 4)`` vectors of four.
     """
 
     matrix: wp.array
     vectors: wp.array
-    fours: wp.array
 
     @property
     def length(self) -> int:
         """K."""
         return self.matrix.shape[1]
 
+    @cached_property
+    def fours(self) -> wp.array:
+        """The same memory, ``(N, K / 4)`` vectors of four, for a K that four divides."""
+        start, shape, strides = self.matrix.ptr, (self.matrix.shape[0], self.length // 4), (self.matrix.strides[0], 16)
+        return wp.array(ptr=start, shape=shape, strides=strides, dtype=wp.vec4, device=self.matrix.device)
+
     @classmethod
     def of(cls, matrix: wp.array) -> Rows:
-        """Read a matrix, whose rows are compact, as rows."""
-        count, length = matrix.shape
-        dtype, device, start = channel_vector(length), matrix.device, matrix.ptr
-        if not count:
-            return cls(matrix, wp.zeros(0, dtype=dtype, device=device), wp.zeros((0, 1), dtype=wp.vec4, device=device))
-        apart = matrix.strides[0]
-        vectors = wp.array(ptr=start, shape=count, strides=(apart,), dtype=dtype, device=device)
-        fours = wp.array(ptr=start, shape=(count, length // 4), strides=(apart, 16), dtype=wp.vec4, device=device)
-        return cls(matrix, vectors, fours)
+        """Read a matrix as rows."""
+        return cls(matrix, matrix.view(channel_vector(matrix.shape[1])))
 
     @classmethod
     def zeros(cls, count: int, length: int, device: Any) -> Rows:

@@ -173,7 +173,7 @@ class Rasterizer:
             self._buffers.tallies.zero_()  # a frame that was refused may have left some
             forward.project(self._buffers, gaussians)
             forward.evaluate_colors(self._buffers, gaussians)
-            forward.gather_channels(self._buffers)
+            forward.gather_channels(self._buffers, gaussians)
             self._buffers.wait_for(self._buffers.gathering)
             self._bands = forward.plan_bands(self._buffers)
             for band in self._bands:
@@ -199,7 +199,9 @@ class Rasterizer:
         with wp.ScopedDevice(self.device):
             forward.project(self._buffers, gaussians)
             forward.evaluate_colors(self._buffers, gaussians)
-            forward.gather_channels(self._buffers)  # beside the lists: `relist` and then `redraw_values` take longer
+            forward.gather_channels(
+                self._buffers, gaussians
+            )  # beside the lists: `relist` and then `redraw_values` take longer
             forward.list_pairs(self._buffers)
             self._buffers.wait_for(self._buffers.gathering)
             self._composite()
@@ -234,7 +236,7 @@ class Rasterizer:
         if len(self._bands) > 1:
             return self.draw(gaussians)
         with wp.ScopedDevice(self.device):
-            forward.gather_channels(self._buffers)
+            forward.gather_channels(self._buffers, gaussians)
             self._buffers.wait_for(self._buffers.gathering)
             self._composite()
         return self.images

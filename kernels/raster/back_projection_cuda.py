@@ -25,11 +25,11 @@ from beam_warp.kernels.common.launching import launch
 from beam_warp.kernels.raster.bin_tiles import SIDE
 from beam_warp.kernels.raster.composite import Images, RasterFrame, channel_vector, pixel_below, pixel_place
 from beam_warp.kernels.raster.composite_adjoint_cuda import PART, THREADS, WARPS
-from beam_warp.kernels.raster.composite_cuda import CENTER, LANES, SHAPE
+from beam_warp.kernels.raster.composite_cuda import CENTER, SHAPE
 from beam_warp.kernels.raster.project import LOG_CUT
 from beam_warp.kernels.raster.splat_rows import alpha_of, behind, log_alpha_of, offset_from, whiten
 from beam_warp.kernels.raster.strided_rows import load_row
-from beam_warp.kernels.raster.warp_lists_cuda import reaches
+from beam_warp.kernels.raster.warp_lists_cuda import LANES, reaches
 
 
 @cache

@@ -47,11 +47,11 @@ from beam_warp.kernels.raster.composite_adjoint import (
     pair_vector,
     pixel_adjoint,
 )
-from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, LANES, PART, SHAPE, SLOPE, STRIDE
+from beam_warp.kernels.raster.composite_cuda import BEND, CENTER, PART, SHAPE, SLOPE, STRIDE
 from beam_warp.kernels.raster.project import LOG_CUT, Splat
 from beam_warp.kernels.raster.splat_rows import alpha_of, sight_of
 from beam_warp.kernels.raster.strided_rows import load_row
-from beam_warp.kernels.raster.warp_lists_cuda import reaches
+from beam_warp.kernels.raster.warp_lists_cuda import LANES, reaches
 
 WARPS = 4
 """Warps of a block: a tile is 16 x 16 pixels."""

@@ -38,6 +38,7 @@ from beam_warp.kernels.raster.composite import (
     pixel_place,
 )
 from beam_warp.kernels.raster.project import LOG_CUT
+from beam_warp.kernels.raster.sort_entries_cuda import sort_entries_function
 from beam_warp.kernels.raster.splat_rows import (
     MEDIAN,
     alpha_of,
@@ -50,7 +51,6 @@ from beam_warp.kernels.raster.splat_rows import (
     whiten,
 )
 from beam_warp.kernels.raster.strided_rows import load_row
-from beam_warp.kernels.raster.tile_lists_cuda import sort_entries_function
 from beam_warp.kernels.raster.warp_lists_cuda import LANES, box_of, warp_lists_functions
 
 PART = wp.constant(8)

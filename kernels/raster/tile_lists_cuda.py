@@ -1,19 +1,14 @@
 """Lists of the splats that each tile draws on CUDA: count, plan, emit; each tile's block then sorts its own list.
 
 A pair of tile and splat is an entry of its tile: the splat's depth, its number, and the pair's rank among the splat's
-pairs in one, so that equal depths keep the order of the splats. A block sorts the nearest entries of its tile first,
-and as many more as its pixels look at: where the front hides the rest, most of a long list is never sorted.
-
-Entries are emitted by atomics, in any order; once they are sorted nothing of it is left. The slots of pairs follow from
-their ranks, when the way back asks for them.
+pairs in one, so that equal depths keep the order of the splats. Entries are emitted by atomics, in any order; once they
+are sorted (`sort_entries_cuda`) nothing of it is left. From ranks follow the slots of pairs (`pair_slots_cuda`).
 """
-
-from functools import cache
 
 import warp as wp
 
 from beam_warp.kernels.common.launching import launch, launcher
-from beam_warp.kernels.raster.bin_tiles import Band, SplatOrder, TileLists, tile_box, tile_columns
+from beam_warp.kernels.raster.bin_tiles import Band, TileLists, tile_box, tile_columns
 from beam_warp.kernels.raster.project import CameraMove, Projection, RasterView, Splats, project_still, write_splat
 from beam_warp.kernels.raster.strided_rows import load_row
 
@@ -21,9 +16,6 @@ from beam_warp.kernels.raster.strided_rows import load_row
 # counted and not emitted leaves what an earlier frame wrote. So each operation is rounded by itself: which products and
 # sums a compiler fuses depends on the code around them.
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fuse_fp": False})
-
-SORTED = 1024
-"""Most entries that a block sorts at a time."""
 
 SPREAD = wp.constant(8)
 """Numbers of a tile's tally: atomics on one sector of 32 bytes wait for each other. The first is that of its pairs."""
@@ -35,9 +27,6 @@ AHEAD = 4
 """Tiles of a row whose pairs are emitted together."""
 
 Places = wp.types.vector(length=AHEAD, dtype=int)
-
-FEW = 128
-"""Most entries of a list that are compared with each other: a thread each."""
 
 SPLATS_A_BLOCK = 128
 """Threads of the blocks that count and emit, a splat each: its rows of tiles are many or few, and a block ends with its
@@ -55,9 +44,6 @@ rank."""
 
 MOST_RANK_BITS = 16
 """Most bits of a rank."""
-
-SLOT_FINDERS = wp.constant(128)
-"""Threads that find the far slots of a tile's pairs."""
 
 
 @wp.func
@@ -192,53 +178,6 @@ def emit_entries_kernel(
         rank += counts[0] + counts[1]
 
 
-@wp.kernel
-def find_slots_kernel(first: int, order: SplatOrder, lists: TileLists, out_slots: wp.array[int]):
-    """What is not sorted gets slots of no meaning."""
-    place = first + wp.tid()
-    splat = lists.splats[place]
-    slot = order.ends[splat] - order.counts[splat] + int(lists.ranks[place])
-    out_slots[place] = slot_within(slot, out_slots.shape[0])
-
-
-@wp.func
-def slot_within(slot: int, capacity: int) -> int:
-    """A slot, or -1 beyond the capacity. Ends beyond the range of integers come out negative, and so do their slots."""
-    return wp.where(slot >= 0 and slot < capacity, slot, -1)
-
-
-@wp.kernel
-def find_far_slots_kernel(
-    first: int,
-    order: SplatOrder,
-    splats: Splats,
-    views: wp.array[RasterView],
-    tile_views: wp.array[int],
-    gaussian_count: int,
-    band: Band,
-    lists: TileLists,
-    out_slots: wp.array[int],
-):
-    """The pairs of a splat follow one another as its tiles do, row by row."""
-    item = first + wp.tid()
-    listed = item / SLOT_FINDERS
-    tile = band.first_tile + listed
-    view = views[tile_views[tile]]
-    own_row = (tile - view.first_tile) / view.columns
-    own_column = (tile - view.first_tile) % view.columns
-    for i in range(lists.ranges[listed][0] + item % SLOT_FINDERS, lists.ends[listed], SLOT_FINDERS):
-        if int(lists.ranks[i]) == last_rank(lists):
-            splat = lists.splats[i]
-            center = load_row(splats.centers, splat)
-            shape = load_row(splats.shapes, splat)
-            box = tile_box(center, shape, view, band)
-            rank = own_column - tile_columns(center, shape, view, box, own_row)[0]
-            for row in range(box[1], own_row):
-                columns = tile_columns(center, shape, view, box, row)
-                rank += columns[1] - columns[0]
-            out_slots[i] = slot_within(order.ends[splat] - order.counts[splat] + rank, out_slots.shape[0])
-
-
 _PLAN_TILES = """
 #if defined(__CUDA_ARCH__)
     // Classes of lengths, four an octave; those of longer lists are drawn first, empty ones last.
@@ -351,195 +290,6 @@ def plan_tiles_kernel(
     plan_tiles(tallies, tile_count, own_count, capacity, out_ranges, out_order, out_total)
 
 
-_SORT_ENTRIES = """
-#if defined(__CUDA_ARCH__)
-    typedef unsigned long long Entry;
-    __shared__ Entry held[SORTED];
-    __shared__ int bins[4 * THREADS];
-    __shared__ int parts[THREADS];  // ends of the parts of a long list
-    __shared__ Entry least[THREADS / 32], greatest[THREADS / 32];  // of each warp
-    __shared__ int sums[THREADS / 32];
-    __shared__ Entry bound;  // every entry of a part before it is listed
-    __shared__ int fitting, count;  // bins to be listed, and entries in them
-    const int thread = threadIdx.x, lane = thread & 31, warp = thread >> 5;
-    const Entry* from = reinterpret_cast<const Entry*>(entries.data);
-    Entry low, high;
-    int shift;
-    const auto visit = [&](auto look) {
-        for (int i = begin + thread; i < end; i += 4 * THREADS) {
-            Entry four[4];
-            #pragma unroll
-            for (int k = 0; k < 4; ++k)
-                four[k] = from[min(i + k * THREADS, end - 1)];
-            #pragma unroll
-            for (int k = 0; k < 4; ++k)
-                if (i + k * THREADS < end)
-                    look(four[k]);
-        }
-    };
-    const auto find_range = [&](Entry start) {
-        low = ~Entry(0);
-        high = 0;
-        visit([&](Entry entry) {
-            if (entry >= start) {
-                low = min(low, entry);
-                high = max(high, entry);
-            }
-        });
-        for (int step = 16; step > 0; step /= 2) {
-            low = min(low, __shfl_xor_sync(0xffffffffu, low, step));
-            high = max(high, __shfl_xor_sync(0xffffffffu, high, step));
-        }
-        if (lane == 0) {
-            least[warp] = low;
-            greatest[warp] = high;
-        }
-        __syncthreads();
-        for (int i = 0; i < THREADS / 32; ++i) {
-            low = min(low, least[i]);
-            high = max(high, greatest[i]);
-        }
-    };
-    const auto sum_before = [&](int own) {
-        int sum = own;
-        for (int step = 1; step < 32; step *= 2) {
-            const int other = __shfl_up_sync(0xffffffffu, sum, step);
-            sum += lane >= step ? other : 0;
-        }
-        if (lane == 31)
-            sums[warp] = sum;
-        __syncthreads();
-        for (int i = 0; i < warp; ++i)
-            sum += sums[i];
-        return sum - own;
-    };
-    const auto write = [&](int place, Entry entry) {
-        const Entry number = entry & (((Entry)1 << NUMBER_BITS) - 1);
-        splats.data[listed + place] = (int)(number >> rank_bits);
-        ranks.data[listed + place] = (unsigned short)(number & ((1u << rank_bits) - 1));
-    };
-    const int length = end - begin;
-    if (length <= FEW) {
-        Entry entry = 0;
-        if (thread < length)
-            entry = held[thread] = from[begin + thread];
-        __syncthreads();
-        if (thread < length) {
-            int place = 0;
-            for (int k = 0; k < length; ++k)
-                place += held[k] < entry;
-            write(place, entry);
-        }
-        __syncthreads();
-        return end;
-    }
-    Entry start = 0;
-    if (length > SORTED) {
-        Entry* to = reinterpret_cast<Entry*>(parted.data);
-        if (listed == begin) {
-            find_range(0);
-            shift = max(0, 64 - __clzll(high - low) - BITS);
-            parts[thread] = 0;
-            __syncthreads();
-            visit([&](Entry entry) { atomicAdd(parts + (int)((entry - low) >> shift), 1); });
-            __syncthreads();
-            parts[thread] = sum_before(parts[thread]);
-            __syncthreads();
-            visit([&](Entry entry) { to[begin + atomicAdd(parts + (int)((entry - low) >> shift), 1)] = entry; });
-            __syncthreads();
-        }
-        from = to;
-        const int done = listed - begin;
-        const int part = __syncthreads_count(parts[thread] <= done);
-        const int part_begin = part > 0 ? parts[part - 1] : 0;
-        const int fit = __syncthreads_count(parts[thread] <= part_begin + SORTED);
-        if (part_begin < done)
-            start = bound;
-        end = begin + parts[part_begin == done && fit > part ? fit - 1 : part];
-        begin += part_begin;
-    }
-    find_range(start);
-    // Narrow the range until its first bins hold few enough; no two entries are equal.
-    for (bool few = false; !few;) {
-        shift = max(0, 64 - __clzll(high - low) - BITS - 2);
-        int* four = bins + 4 * thread;
-        for (int k = 0; k < 4; ++k)
-            four[k] = 0;
-        __syncthreads();
-        visit([&](Entry entry) {
-            if (entry >= low && entry <= high)
-                atomicAdd(bins + (int)((entry - low) >> shift), 1);
-        });
-        __syncthreads();
-        int sum = sum_before(four[0] + four[1] + four[2] + four[3]);
-        for (int k = 0; k < 4; ++k) {
-            const int before = sum;
-            sum += four[k];
-            four[k] = before;
-            const bool is_last = thread == THREADS - 1 && k == 3;
-            if (before <= SORTED && (sum > SORTED || is_last)) {
-                fitting = 4 * thread + k + (sum <= SORTED);
-                count = sum <= SORTED ? sum : before;
-            }
-        }
-        __syncthreads();
-        few = fitting > 0;
-        if (fitting < 4 * THREADS)
-            high = min(high, low + ((Entry)max(fitting, 1) << shift) - 1);
-    }
-    visit([&](Entry entry) {
-        if (entry >= low && entry <= high)
-            held[atomicAdd(bins + (int)((entry - low) >> shift), 1)] = entry;
-    });
-    __syncthreads();
-    const int found = count;
-    if (thread == 0)
-        bound = high + 1;
-    for (int i = thread; i < found; i += THREADS) {
-        const Entry entry = held[i];
-        const int bin = (int)((entry - low) >> shift);
-        int place = bin > 0 ? bins[bin - 1] : 0;
-        const int bin_end = bins[bin];
-        for (int k = place; k < bin_end; ++k)
-            place += held[k] < entry;
-        write(place, entry);
-    }
-    __syncthreads();
-    return listed + found;
-#else
-    return end;
-#endif
-"""
-
-
-@cache
-def sort_entries_function(threads: int):
-    """Return the function with which a block of so many threads, a power of two, sorts a tile's list part by part."""
-    snippet = _SORT_ENTRIES.replace("NUMBER_BITS", str(NUMBER_BITS))
-    snippet = snippet.replace("THREADS", str(threads)).replace("BITS", str(threads.bit_length() - 1))
-
-    @wp.func_native(snippet.replace("SORTED", str(SORTED)).replace("FEW", str(FEW)))
-    def sort_entries(
-        entries: wp.array[wp.uint64],
-        begin: int,
-        listed: int,
-        end: int,
-        parted: wp.array[wp.uint64],
-        splats: wp.array[int],
-        ranks: wp.array[wp.uint16],
-        rank_bits: int,
-    ) -> int:
-        """List the next entries of a tile in order, at most `SORTED`, after those ``listed``; return the new end.
-
-        ``begin`` and ``end`` are the tile's range; a long list is parted by depth first, into ``parted``. Entries of a
-        part are counted in bins, four a thread, and those of a bin compared with each other. All threads of the block
-        call it together.
-        """
-        ...
-
-    return sort_entries
-
-
 launch_count_entries = launcher(count_entries_kernel, in_order=True)
 """Count the pairs of every splat and, added to zeros, those of every tile of a band."""
 
@@ -584,19 +334,3 @@ def launch_emit_entries(splats, views, gaussian_count, band, tallies, lists, dev
 def rank_bits(splat_count):
     """Return how many bits of an entry are left for a rank, where there are so many splats."""
     return min(NUMBER_BITS - max(splat_count - 1, 1).bit_length(), MOST_RANK_BITS)
-
-
-launch_find_slots = launcher(find_slots_kernel)
-"""Write the slots of all pairs whose ranks are known."""
-
-
-def launch_find_far_slots(order, splats, views, tile_views, gaussian_count, band, lists, device):
-    """Write the slots of those pairs whose rank says too little, among what is sorted of all lists of a band."""
-    launch(
-        find_far_slots_kernel,
-        (band.end_tile - band.first_tile) * int(SLOT_FINDERS),
-        inputs=[order, splats, views, tile_views, gaussian_count, band, lists],
-        outputs=[lists.slots],
-        device=device,
-        block_dim=int(SLOT_FINDERS),
-    )

@@ -13,9 +13,9 @@ import warp as wp
 from beam_warp.kernels.common.lanes import ballot, bits_below_lane, count_bits
 from beam_warp.kernels.raster.bin_tiles import TileLists
 from beam_warp.kernels.raster.project import Splats
+from beam_warp.kernels.raster.sort_entries_cuda import SORTED
 from beam_warp.kernels.raster.splat_rows import EXTENT_MARGIN, RELATIVE_MARGIN, quick_divide, squared_extent, whiten
 from beam_warp.kernels.raster.strided_rows import load_row
-from beam_warp.kernels.raster.tile_lists_cuda import SORTED
 
 LANES = wp.constant(32)
 
@@ -131,7 +131,7 @@ def warp_lists_functions(threads: int) -> WarpLists:
 
     @wp.func
     def put_box(part: int, lane: int, column: int, row: int, box: int):
-        if lane == 0:
+        if lane == 0:  # both corners move by the same column and row
             share(PUT_BOX, part, wp.where(box < 0, box, box + (column + 16 * row) * 257))
 
     @wp.func

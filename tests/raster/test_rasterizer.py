@@ -14,6 +14,7 @@ from support.raster_clouds import around, cloud, drawn, set_upstream
 from beam_warp import GaussianCloud, rasterize
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
+from beam_warp.kernels.raster import tile_lists_cuda
 from beam_warp.kernels.raster.composite_cuda import STRIDE
 from beam_warp.raster import buffers, forward, rasterizer
 from beam_warp.raster.gbuffer import rasterize_backward
@@ -244,8 +245,10 @@ def test_large_images_have_the_bits_of_small_ones(device, rng, monkeypatch, dept
     assert_same(*found)
 
 
-def test_splats_that_reach_very_many_tiles(device, made, values):
-    """Ranks of pairs beyond what an entry has bits for: gradients on CUDA are those on the CPU."""
+@pytest.mark.parametrize("bits", [16, 4])
+def test_splats_that_reach_very_many_tiles(device, made, values, monkeypatch, bits):
+    """Also ranks of pairs beyond what an entry has bits for: gradients on CUDA are those on the CPU."""
+    monkeypatch.setattr(tile_lists_cuda, "MOST_RANK_BITS", bits)
     scales = made.scales.copy()
     scales[::20] *= 30.0
     large, camera = made.with_arrays(scales=scales), around(230, 170)
@@ -254,6 +257,7 @@ def test_splats_that_reach_very_many_tiles(device, made, values):
         filled(np.random.default_rng(1), drawer)
     one, other = (state(drawer) for drawer in drawers)
     assert drawers[0].pair_count() > 10 * 100
+    assert drawers[0]._buffers.may_lack_ranks == (bits == 4)
     for i in range(5, len(one)):
         assert np.linalg.norm(one[i] - other[i]) <= 1e-5 * np.linalg.norm(one[i])
 

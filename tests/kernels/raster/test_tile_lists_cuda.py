@@ -1,4 +1,4 @@
-"""Every tile's list has its room and its turn, is sorted by depth and splat, piece by piece, and finds its slots."""
+"""Every tile's list has its room and its turn, is sorted by depth and splat, piece by piece."""
 
 from functools import cache
 
@@ -8,19 +8,16 @@ import warp as wp
 
 from beam_warp.kernels.raster.bin_tiles import SIDE, Band, SplatOrder, TileLists
 from beam_warp.kernels.raster.project import LOG_CUT, Projection, RasterView, Splats
+from beam_warp.kernels.raster.sort_entries_cuda import SORTED, sort_entries_function
 from beam_warp.kernels.raster.splat_rows import EXTENT_MARGIN, RELATIVE_MARGIN
 from beam_warp.kernels.raster.tile_lists_cuda import (
     NEXT_PLACE,
     NUMBER_BITS,
-    SORTED,
     SPREAD,
     launch_emit_entries,
-    launch_find_far_slots,
-    launch_find_slots,
     launch_plan_tiles,
     launch_project_entries,
     rank_bits,
-    sort_entries_function,
 )
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.world.camera import Camera
@@ -149,7 +146,7 @@ def test_every_pair_that_is_counted_is_emitted(rng):
         positions += np.where(np.isfinite(shift), shift, 0.0)[:, None] * axes
     wp.utils.array_scan(order.counts, order.ends, inclusive=True)
     pairs = int(order.ends.numpy()[-1])
-    lists.ranges, lists.order, lists.ends = zeros(tile_count, wp.vec2i), zeros(tile_count), zeros(tile_count)
+    lists.ranges, lists.order = zeros(tile_count, wp.vec2i), zeros(tile_count)
     lists.entries, lists.rank_bits, total = zeros(pairs, wp.uint64), rank_bits(count), zeros(1)
     counted = tallies.numpy()[:: int(SPREAD)]
     launch_plan_tiles(tallies, tile_count, pairs, lists, total, device)
@@ -162,22 +159,10 @@ def test_every_pair_that_is_counted_is_emitted(rng):
     listed, ranks = np.divmod(lists.entries.numpy().astype(np.int64) % 2**NUMBER_BITS, 2**lists.rank_bits)
     owners = np.repeat(np.arange(count), order.counts.numpy())
     np.testing.assert_array_equal(np.sort(listed), owners)
-    # Every pair has a slot of its own, among those of its splat; beyond the capacity it has none.
-    tile_views = wp.array(layout.tile_views, dtype=int, device=device)
-    last = 2**lists.rank_bits - 1
-    for capacity, known in ((pairs, ranks), (pairs, np.full(pairs, last)), (pairs // 2, ranks)):
-        lists.ranks = wp.array(known, dtype=wp.uint16, device=device)
-        lists.splats = wp.array(listed[:capacity], dtype=int, device=device)
-        lists.slots = zeros(capacity)
-        lists.ends.assign(np.minimum(np.cumsum(counted), capacity))
-        launch_find_slots(capacity, order, lists, lists.slots, device)
-        if known is not ranks:
-            launch_find_far_slots(order, splats, views, tile_views, count, band, lists, device)
-        slots = lists.slots.numpy()
-        has_slot = slots >= 0
-        np.testing.assert_array_equal(owners[slots[has_slot]], listed[:capacity][has_slot])
-        assert len(np.unique(slots[has_slot])) == has_slot.sum()
-        assert has_slot.all() == (capacity == pairs)
+    # Ranks are those of a splat's tiles, row by row.
+    tiles = np.repeat(np.arange(tile_count), counted)
+    ordered = np.lexsort((tiles, listed))
+    np.testing.assert_array_equal(ranks[ordered], np.concatenate([np.arange(n) for n in order.counts.numpy()]))
 
 
 def _left_end(shapes, squared, top, bottom):
