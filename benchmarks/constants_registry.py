@@ -24,7 +24,7 @@ LAMPS = "only lamps use it; relit views have none"
 EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 MASKED = "these captures have masks; it counts only for photographs without"
 EXACT_EXPOSURES = "exposures of these captures are equal, and colours stay as they are"
-CLEAN_PHOTOGRAPHS = "photographs of these captures are clean, and noise asks for no dropout"
+CLEAN_PHOTOGRAPHS = "photographs of these captures are clean, and noise asks for neither dropout nor total variation"
 MANY_PHOTOGRAPHS = "these captures have so many photographs that opacities are not reset"
 EXACT_RIGS = "cameras of these captures are exact, and stay as they are"
 SCENE_LINEAR = "the captures are scene-linear, so that no exposure is looked for"
@@ -222,6 +222,16 @@ TRACKING = (
             ("DROPOUT_OF_NOISE", ALL, "Part that a step leaves out, over noise and what a pixel has too many."),
             ("LEAST_DROPOUT", JUDGED, "Part below which none is left out."),
             ("MOST_DROPOUT", JUDGED, "Largest part that is left out."),
+        )
+    ),
+    *(
+        Constant(f"beam_warp.reconstruction.total_variation:{name}", chosen_on, does, CLEAN_PHOTOGRAPHS)
+        for name, chosen_on, does in (
+            ("VARIATION_OF_NOISE", ALL, "Weight of the total variation of radiance, over the variance of noise."),
+            ("LEAST_VARIATION", JUDGED, "Weight below which it does not count."),
+            ("MOST_VARIATION", ALL + ", a painted ball", "Largest weight."),
+            ("NEIGHBORS", JUDGED, "Neighbours that radiance is compared with."),
+            ("ROUNDING", JUDGED, "Difference below which it counts by its square."),
         )
     ),
     Constant(FIT + "EARLY_DROPOUT", ALL, "Part that a step leaves out in the first half, where it can be spared."),
@@ -609,7 +619,7 @@ UNTUNED = {
         TrackOptions: joints.weights.normal
         TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every refinement.dropout
-        TrackOptions: refinement.reset_below
+        TrackOptions: refinement.reset_below refinement.total_variation
         TrackOptions: refinement.refine_until refinement.split_fraction refinement.hidden_share refinement.dead_opacity
         BakeOptions: passes ridge temporal low high""",
     "limits of memory, time and floating point, and sizes of blocks": """

@@ -19,6 +19,7 @@ Sources: slanted-edge measurement of sharpness (ISO 12233); Immerkær 1996 (nois
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -311,6 +312,13 @@ def relative_noise(color: NDArray[np.float32], solid: NDArray[np.bool_]) -> floa
     """
     level = float(np.median(color[solid])) if solid.any() else 0.0
     return float(np.sqrt(np.maximum(photon_noise(color, solid), 0.0) / level)) if level > 0.0 else np.nan
+
+
+def noise_of_views(views: Sequence[CapturedView]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return how many pixels of each view show the subject alone, and their `relative_noise`, ``(V,)`` each."""
+    subjects = [subject_pixels(view) for view in views]
+    noise = [relative_noise(view.color, subject) for view, subject in zip(views, subjects, strict=True)]
+    return np.array([np.count_nonzero(subject) for subject in subjects]), np.array(noise)
 
 
 def _some(places: NDArray[np.int64], most: int) -> NDArray[np.int64]:

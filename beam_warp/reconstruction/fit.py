@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from beam_warp.capture.quality import relative_noise, subject_pixels
+from beam_warp.capture.quality import noise_of_views
 from beam_warp.capture.views import CapturedView
 from beam_warp.checks import require_choice, require_count, require_number
 from beam_warp.device.arrays import resolve_device
@@ -40,6 +40,7 @@ from beam_warp.reconstruction.targets import (
     shuffled_views,
 )
 from beam_warp.reconstruction.temporal import TemporalTerms
+from beam_warp.reconstruction.total_variation import RadianceVariation, chosen_variation
 from beam_warp.world.gaussians import GaussianCloud
 
 PRESETS = ("fast", "draft", "paper", "rade")
@@ -150,6 +151,7 @@ class FitOptions:
         dead_opacity: Gaussians below it are dropped.
         dropout: Part of the Gaussians that a step leaves out, others each time, so that none of them learns the noise
             of a photograph; ``"auto"``: see `chosen_dropout`.
+        total_variation: Weight of how much radiance differs among neighbours; ``"auto"``: see `chosen_variation`.
         reset_below: With fewer photographs, of known coverage, the refinement after `RESET_AFTER` of `RESET_STEPS` or
             more lowers all opacities to `RESET_OPACITY` (Kerbl et al. 2023): a layer that few of them agree on hides
             others no more, and must earn its opacity again.
@@ -176,6 +178,7 @@ class FitOptions:
     hidden_share: float = 0.01
     dead_opacity: float = 0.02
     dropout: float | Literal["auto"] = "auto"
+    total_variation: float | Literal["auto"] = "auto"
     reset_below: int = PLENTY
     seed: int = 0
 
@@ -194,13 +197,15 @@ class FitOptions:
         require_number("temporal", self.temporal, 0.0)
         if self.dropout != "auto":
             require_number("dropout", self.dropout, 0.0, MOST_DROPOUT)
+        if self.total_variation != "auto":
+            require_number("total_variation", self.total_variation, 0.0)
 
     @classmethod
     def of_preset(cls, preset: str, **changes: Any) -> FitOptions:
         """Return the options of a preset, some of them changed.
 
         ``fast`` is ours, ``draft`` a seventh of its steps, larger ones: for a first look, and for a CPU. They are too
-        few to learn noise, so nothing is left out of them. ``paper`` is
+        few to learn noise, so nothing is left out of them, nor held even. ``paper`` is
         BEAM's schedule: 7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term
         of coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter,
         normals at 0.05 for the second half. The latter two draw one sample a pixel.
@@ -211,7 +216,8 @@ class FitOptions:
         require_choice("preset", preset, PRESETS)
         rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
         common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
-        common |= {"dropout": 0.0, "reset_below": 0}
+        clean: dict[str, Any] = {"dropout": 0.0, "total_variation": 0.0}
+        common |= {**clean, "reset_below": 0}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
             "draft": {
@@ -219,7 +225,7 @@ class FitOptions:
                 "normal_iterations": 300,
                 "refine_every": 100,
                 "rates": LearningRates(positions=8e-4, scales=2e-2, opacities=6e-2, bands=1e-3, final_others=1.0),
-                "dropout": 0.0,
+                **clean,
             },
             "paper": {
                 **common,
@@ -249,8 +255,8 @@ class Fit:
     Attributes:
         cloud: Gaussians with scene-linear radiance and ids.
         report: JSON-able record: ``psnr`` of the training views' crops [dB], lowest ``view_psnr``, ``gaussians``,
-            ``iterations``, ``samples``, ``dropout`` in the first half of the steps and afterwards, ``seconds``;
-            ``growth`` with a target.
+            ``iterations``, ``samples``, ``dropout`` in the first half of the steps and afterwards, the weight
+            ``total_variation``, ``seconds``; ``growth`` with a target.
     """
 
     cloud: GaussianCloud
@@ -263,20 +269,21 @@ def mean_psnr(psnr: NDArray[np.float64]) -> float:
     return float(known.mean()) if len(known) else NO_PSNR
 
 
-def chosen_dropout(dropout: float | Literal["auto"], count: int, views: Sequence[CapturedView]) -> tuple[float, float]:
+def chosen_dropout(
+    dropout: float | Literal["auto"], count: int, pixels: NDArray[np.int64], noise: NDArray[np.float64]
+) -> tuple[float, float]:
     """Return the parts of the Gaussians that a step leaves out: in the first half of all steps, and afterwards.
 
     Args:
         dropout: Both; ``"auto"``: what the photographs' noise asks for, in the median, see `DROPOUT_OF_NOISE`, and in
             the first half `EARLY_DROPOUT` at least. None where a pixel has no more Gaussians than `NEEDED`.
         count: Number of Gaussians.
-        views: The photographs.
+        pixels: How many pixels of each photograph show the subject, ``(V,)``.
+        noise: Standard deviation of their noise, as a part of the value, ``(V,)``; NaN where it is not known.
     """
     if dropout != "auto":
         return float(dropout), float(dropout)
-    subjects = [subject_pixels(view) for view in views]
-    spare = np.array([max(count / max(np.count_nonzero(subject), 1) - NEEDED, 0.0) for subject in subjects])
-    noise = np.array([relative_noise(view.color, subject) for view, subject in zip(views, subjects, strict=True)])
+    spare = np.maximum(count / np.maximum(pixels, 1) - NEEDED, 0.0)
     wanted = (DROPOUT_OF_NOISE * noise**2 * spare)[np.isfinite(noise)]
     early = EARLY_DROPOUT * min(float(np.median(spare)) / NEEDED, 1.0)
     always = min(float(np.median(wanted)), MOST_DROPOUT) if len(wanted) else 0.0
@@ -364,6 +371,7 @@ class Fitter:
         parameters: The Gaussians.
         samples: Side of the square of samples of a pixel.
         dropout: Parts of the Gaussians that steps leave out, see `chosen_dropout`.
+        total_variation: Weight of how much radiance differs among neighbours, see `chosen_variation`.
     """
 
     def __init__(
@@ -380,7 +388,10 @@ class Fitter:
         count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
         self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
         self.samples = chosen_samples(options.samples, start, views)
-        self.dropout = chosen_dropout(options.dropout, count, views)
+        asked = "auto" in (options.dropout, options.total_variation)
+        pixels, noise = noise_of_views(views if asked else ())
+        self.dropout = chosen_dropout(options.dropout, count, pixels, noise)
+        self.total_variation = chosen_variation(options.total_variation, noise)
         self._targets = targets or TargetSet(views, count, options.raster, self.samples, device)
         center = np.median(start.positions, axis=0)
         extent = float(np.mean([np.linalg.norm(view.camera.position - center) for view in views]))
@@ -398,6 +409,7 @@ class Fitter:
         self._gradient_sums = wp.zeros(count, dtype=float, device=device)
         self._gradient_counts = wp.zeros(count, dtype=float, device=device)
         self._temporal = TemporalTerms(self.parameters, disc_spacing(start)) if options.temporal > 0.0 else None
+        self._variation = RadianceVariation(self.parameters) if self.total_variation > 0.0 else None
         self._graphs = StepGraphs(device)
         self._weights = options.weights
         self._left_out = self.dropout[0]
@@ -447,6 +459,7 @@ class Fitter:
             "iterations": self._taken,
             "samples": self.samples,
             "dropout": self.dropout,
+            "total_variation": self.total_variation,
         }
 
     def psnr(self) -> NDArray[np.float64]:
@@ -509,6 +522,8 @@ class Fitter:
         parameters.add_gradients(drawn)
         if self._temporal is not None:
             self._temporal.add_gradients(self.options.temporal)
+        if self._variation is not None:  # as photographs' differences count: for each pixel of the view
+            self._variation.add_gradients(self.total_variation / (group.height * group.width))
         self._adam.step()
 
     def _refine(self, *, is_late: bool) -> None:
@@ -529,5 +544,7 @@ class Fitter:
         self._adam.restart(changed)
         if self._temporal is not None:
             self._temporal.hold(changed)
+        if self._variation is not None:
+            self._variation.find_neighbors()
         self._gradient_sums.zero_()
         self._gradient_counts.zero_()

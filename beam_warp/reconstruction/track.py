@@ -76,6 +76,7 @@ class TrackOptions:
             rates=LearningRates(1e-4, 1e-3, 2e-3, 1e-2, 5e-3, 2.5e-4, final_positions=0.1, final_others=1.0),
             temporal=1e-3,
             dropout=0.0,
+            total_variation=0.0,
         )
     )
     largest_drop: float = 6.0
