@@ -28,7 +28,7 @@ def added(parameters, variation):
 
 @pytest.mark.parametrize("count", [1, 2, 60])
 def test_neighbors_are_the_nearest_that_are_there(device, rng, count):
-    """All distances in double precision tell them: rows without a Gaussian are nobody's; those that moved have others."""
+    """All distances in double precision tell them: rows without a Gaussian are nobody's, and what moved has others."""
     cloud = ball_cloud(60).select(np.arange(count))
     parameters = GaussianParameters(cloud, device, row_count=count + 3)
     variation = RadianceVariation(parameters)
