@@ -169,6 +169,7 @@ def _shown_offsets(views: Sequence[CapturedView], options: FitOptions, device: A
         temporal=0.0,
         refine_every=0,
         dropout=0.0,
+        total_variation=0.0,
     )
     fitter = Fitter(reduced, start, fitting, device)
     fitter.run()

@@ -307,6 +307,7 @@ class RigFitter(Fitter):
             temporal=0.0,
             refine_every=0,
             dropout=0.0,
+            total_variation=0.0,
         )
         super().__init__(reduced, start, fitting, device)
         self.cameras = list(cameras)

@@ -78,3 +78,17 @@ def test_masks_of_a_capture_are_found(device, walker_views, rng):
     found = mend_masks(names, views, FitOptions.of_preset("draft", gaussian_count=8_000), device=device).offsets
     assert list(found) == names
     assert np.abs([found[name].pixels for name in names] - true).max() < 0.3
+
+
+def test_noise_asks_nothing_of_a_short_fit(device, monkeypatch):
+    """Steps that look for masks are too few to learn noise: nothing is left out of them, nor held even."""
+    heard = []
+
+    def noted(views, start, options, device):
+        heard.append((options.dropout, options.total_variation))
+        raise InterruptedError
+
+    monkeypatch.setattr(masks, "Fitter", noted)
+    with pytest.raises(InterruptedError):
+        masks._shown_offsets(ball_views(cameras_around(4)), FitOptions(), device)
+    assert heard == [(0.0, 0.0)]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 from support.moving_ball import ball_views
 from support.moving_ball import rig as cameras_around
@@ -270,3 +271,16 @@ def test_too_few_cameras_or_no_masks_say_nothing():
     names = [f"c{k}" for k in range(8)]
     assert refine_rig(names[:7], views[:7], FitOptions(), device="cpu") is None
     assert refine_rig(names, [replace(views[0], alpha=None), *views[1:]], FitOptions(), device="cpu") is None
+
+
+def test_noise_asks_nothing_of_a_short_fit(device, rng):
+    """A key frame would heed this noise; steps that look for cameras are too few to learn it."""
+    clean = ball_views(cameras_around(8, size=96))
+    noise = [0.1 * np.sqrt(view.color) * rng.normal(size=view.color.shape) for view in clean]
+    views = [replace(view, color=np.float32(view.color + by)) for view, by in zip(clean, noise, strict=True)]
+    options, cameras = FitOptions(gaussian_count=20_000), [view.camera for view in views]
+    fitter = rig.RigFitter(views, cameras, rig.Level(1, 1.0, 3, 1, 1), options, wp.get_device(device))
+    assert (fitter.dropout, fitter.total_variation) == ((0.0, 0.0), 0.0)
+    asked = rig.Fitter(views, fitter.parameters.cloud(), options, wp.get_device(device))
+    assert asked.dropout[1] > 0.0
+    assert asked.total_variation > 0.0
