@@ -616,6 +616,7 @@ UNTUNED = {
         PathOptions: samples seed""",
     "not used, or another option's": """
         FitOptions: raster.near temporal
+        beam_warp.reconstruction.fit: AS_IF_CLEAN
         TrackOptions: joints.weights.normal
         TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every refinement.dropout

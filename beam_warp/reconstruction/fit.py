@@ -9,9 +9,10 @@ Gaussians stays within a budget.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -79,6 +80,9 @@ and what is left out is missed."""
 
 LEAST_DROPOUT, MOST_DROPOUT = 0.005, 0.2
 """Below the first, nothing is left out, as if photographs were clean. The second is the largest part that was tried."""
+
+AS_IF_CLEAN: Mapping[str, Any] = MappingProxyType({"dropout": 0.0, "total_variation": 0.0})
+"""Options of `FitOptions` that heed noise, without heed: of fits whose steps are too few to learn it."""
 
 PLENTY = 24
 """Photographs from which on each Gaussian is seen by as many as on the captures that the schedule was chosen on."""
@@ -205,10 +209,10 @@ class FitOptions:
         """Return the options of a preset, some of them changed.
 
         ``fast`` is ours, ``draft`` a seventh of its steps, larger ones: for a first look, and for a CPU. They are too
-        few to learn noise, so nothing is left out of them, nor held even. ``paper`` is
-        BEAM's schedule: 7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term
-        of coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter,
-        normals at 0.05 for the second half. The latter two draw one sample a pixel.
+        few to learn noise, so nothing is left out of them, nor held even. ``paper`` is BEAM's schedule: 7,000 steps for
+        colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term of coverage. ``rade`` is that of
+        RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter, normals at 0.05 for the second
+        half. The latter two draw one sample a pixel.
 
         Raises:
             InvalidOptionError: There is no such preset, or an option is out of range.
@@ -216,8 +220,7 @@ class FitOptions:
         require_choice("preset", preset, PRESETS)
         rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
         common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
-        clean: dict[str, Any] = {"dropout": 0.0, "total_variation": 0.0}
-        common |= {**clean, "reset_below": 0}
+        common |= {**AS_IF_CLEAN, "reset_below": 0}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
             "draft": {
@@ -225,7 +228,7 @@ class FitOptions:
                 "normal_iterations": 300,
                 "refine_every": 100,
                 "rates": LearningRates(positions=8e-4, scales=2e-2, opacities=6e-2, bands=1e-3, final_others=1.0),
-                **clean,
+                **AS_IF_CLEAN,
             },
             "paper": {
                 **common,

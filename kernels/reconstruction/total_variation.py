@@ -1,10 +1,8 @@
 """Gradients of the total variation of radiance: how much Gaussians differ from those around them."""
 
-from typing import Any
-
 import warp as wp
 
-from beam_warp.kernels.common.launching import launch
+from beam_warp.kernels.common.launching import launcher
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,9 +29,5 @@ def add_variation_gradients_kernel(
                 out_gradients[i, band] = out_gradients[i, band] + (radiance[i, band] - radiance[j, band]) * slope
 
 
-def launch_add_variation_gradients(
-    radiance: Any, neighbors: Any, weight: float, rounding: float, out_gradients: Any, device: Any
-) -> None:
-    """Add ``weight`` times the gradients of sqrt(difference^2 + rounding^2), summed over neighbours; -1 is none."""
-    inputs = [radiance, neighbors, weight, rounding]
-    launch(add_variation_gradients_kernel, radiance.shape[0], inputs=inputs, outputs=[out_gradients], device=device)
+launch_add_variation_gradients = launcher(add_variation_gradients_kernel)
+"""Add ``weight`` times the gradients of sqrt(difference^2 + rounding^2), summed over neighbours; -1 is none."""

@@ -188,6 +188,11 @@ def noisy(view, rng, deviation):
     return replace(view, color=(view.color + noise).astype(np.float32))
 
 
+def dropout_of(count, views):
+    """What the photographs ask for, of so many Gaussians."""
+    return chosen_dropout("auto", count, *noise_of_views(views))
+
+
 class TestDropout:
     def test_as_much_as_noise_asks_for(self, rng):
         """Twice the noise's variance over the level, for each of three Gaussians a pixel beyond two; or the most."""
@@ -196,28 +201,25 @@ class TestDropout:
         level = np.median([np.median(view.color[inside]) for view, inside in zip(clean, solid, strict=True)])
         count = 5 * int(np.median([inside.sum() for inside in solid]))
         for deviation in (0.02, 0.05):
-            found = chosen_dropout("auto", count, *noise_of_views([noisy(view, rng, deviation) for view in clean]))
+            found = dropout_of(count, [noisy(view, rng, deviation) for view in clean])
             assert found[1] == pytest.approx(2.0 * 3.0 * deviation**2 / level, rel=0.1)
             assert found[0] == max(found[1], 0.1)
-        assert chosen_dropout("auto", count, *noise_of_views([noisy(view, rng, 0.2) for view in clean])) == (0.2, 0.2)
+        assert dropout_of(count, [noisy(view, rng, 0.2) for view in clean]) == (0.2, 0.2)
 
     def test_nothing_where_nothing_asks_for_it(self, rng, views):
         """Clean photographs, or too small to tell noise, after half of the steps; fewer Gaussians than pixels."""
         clean = ball_views(rig(6, size=96))
-        assert chosen_dropout("auto", 100_000, *noise_of_views(clean)) == (0.1, 0.0)
-        assert chosen_dropout("auto", 100_000, *noise_of_views([noisy(view, rng, 0.05) for view in views])) == (
-            0.1,
-            0.0,
-        )
-        assert chosen_dropout("auto", 300, *noise_of_views([noisy(view, rng, 0.05) for view in clean])) == (0.0, 0.0)
+        assert dropout_of(100_000, clean) == (0.1, 0.0)
+        assert dropout_of(100_000, [noisy(view, rng, 0.05) for view in views]) == (0.1, 0.0)
+        assert dropout_of(300, [noisy(view, rng, 0.05) for view in clean]) == (0.0, 0.0)
         assert chosen_dropout(0.07, 100_000, *noise_of_views(clean)) == (0.07, 0.07)
 
     def test_at_first_as_many_as_can_be_spared(self):
         """Half of the most, where a pixel has half as many beyond what it needs as it needs: three for two."""
         clean = ball_views(rig(6, size=96))
         pixels = int(np.median([np.count_nonzero(view.alpha > 0.999) for view in clean]))
-        assert chosen_dropout("auto", 3 * pixels, *noise_of_views(clean))[0] == pytest.approx(0.05, rel=0.05)
-        assert chosen_dropout("auto", 2 * pixels, *noise_of_views(clean))[0] <= 0.005
+        assert dropout_of(3 * pixels, clean)[0] == pytest.approx(0.05, rel=0.05)
+        assert dropout_of(2 * pixels, clean)[0] <= 0.005
 
     def test_the_second_half_has_its_own(self, device, views, monkeypatch):
         heard = []
@@ -265,13 +267,15 @@ class TestTotalVariation:
         assert after > before + 0.1
 
     def test_photographs_decide(self, device, rng):
-        """Clean ones ask for none; noisy ones for the variance of their noise, up to the most; drafts never."""
+        """Clean ones ask for none, noisy ones for the variance over the level, or the most; a draft does not ask."""
         clean = ball_views(rig(6, size=96))
-        found = [noisy(view, rng, 0.1) for view in clean]
-        weights = [fitter_of(views, ball_cloud(60), few_steps(), device).total_variation for views in (clean, found)]
-        assert weights == [0.0, 0.003]
+        level = np.median([np.median(view.color[view.alpha > 0.999]) for view in clean])
         draft = FitOptions.of_preset("draft", gaussian_count=300)
-        assert fitter_of(found, ball_cloud(60), draft, device).total_variation == 0.0
+        for deviation, weight in ((0.0, 0.0), (0.02, 0.02**2 / level), (0.1, 0.003)):
+            views = [noisy(view, rng, deviation) for view in clean]
+            asking, quick = (fitter_of(views, ball_cloud(60), chosen, device) for chosen in (few_steps(), draft))
+            assert asking.total_variation == pytest.approx(weight, rel=0.1)
+            assert quick.total_variation == 0.0
 
     def test_halves_have_neighbors_of_their_own(self, device, views, monkeypatch):
         """Neighbours are found at the start, and again after each of two refinements."""

@@ -18,7 +18,7 @@ def variation_around(radiance, others, near, rounding):
 def gradients(radiance, near, weight, rounding, device, before=0.0):
     out = wp.array(np.full(radiance.shape, before, np.float32), dtype=wp.vec3, device=device)
     arrays = wp.array(radiance, dtype=wp.vec3, device=device), wp.array(near, dtype=int, device=device)
-    launch_add_variation_gradients(*arrays, weight, rounding, out, device)
+    launch_add_variation_gradients(len(radiance), *arrays, weight, rounding, out, device)
     return out.numpy()
 
 
