@@ -20,6 +20,7 @@ JUDGED = "by judgement"
 
 NO_IMAGES = "the captures have images; it counts only for Gaussians without"
 IMAGE_PATH = "only the image path uses it, the paper's recipe, which is not run here"
+FINE_PIXELS = "it counts only where pixels are much finer than Gaussians; those of these captures are not"
 LAMPS = "only lamps use it; relit views have none"
 EXACT_MASKS = "masks of these captures are exact, and stay as they are"
 MASKED = "these captures have masks; it counts only for photographs without"
@@ -125,7 +126,11 @@ RECONSTRUCTION = (
     ),
     Constant("beam_warp.reconstruction.densify:SPLIT_OFFSET", WALKER, "How far halves go apart, in deviations."),
     Constant("beam_warp.reconstruction.densify:SPLIT_SHRINK", WALKER, "How long a half is.", most=1.0),
-    Constant(INITIAL + "DISC_WIDTH", WALKER, "Deviation of the first discs, in spacings; also the unit of samples."),
+    Constant(
+        "beam_warp.raster.spacing:DISC_WIDTH",
+        WALKER,
+        "Deviation of the first discs, in spacings; also the unit of samples.",
+    ),
     Constant(INITIAL + "DISC_THICKNESS", WALKER, "Their deviation along the normal, likewise."),
     Constant(INITIAL + "DISC_OPACITY", WALKER, "Their opacity.", most=0.99),
     Constant(INITIAL + "RELAXATIONS", JUDGED, "Rounds in which first points push each other apart."),
@@ -149,8 +154,8 @@ RECONSTRUCTION = (
     ),
     Constant(SEEN_COLORS + "LEAST_COVERAGE", JUDGED, "Coverage below which a pixel's colour does not count.", most=1.0),
     Constant("beam_warp.reconstruction.targets:MATTE_SHARE", ALL, "Coverage's weight before a backdrop.", EXACT_MASKS),
-    Constant("beam_warp.reconstruction.targets:SAMPLES_PER_SPACING", WALKER, "Samples on the distance of neighbours."),
-    Constant("beam_warp.reconstruction.targets:MOST_SAMPLES", WALKER, "Largest side of a pixel's square of samples."),
+    Constant("beam_warp.raster.spacing:SAMPLES_PER_SPACING", WALKER, "Samples on the distance of neighbours."),
+    Constant("beam_warp.raster.spacing:MOST_SAMPLES", WALKER, "Largest side of a pixel's square of samples."),
     Constant("beam_warp.reconstruction.targets:CROP_MARGIN", JUDGED, "Pixels around the subject that are looked at."),
     Constant("beam_warp.reconstruction.hull:AUTO_RESOLUTION", JUDGED, "Least and most voxels along the visual hull."),
     Constant("beam_warp.reconstruction.hull:VOXEL_PIXELS", JUDGED, "Pixels across a voxel."),
@@ -297,7 +302,12 @@ MATERIALS = (
     Constant("beam_warp.materials.normals:OFF_PLANE", ALL, "Distance from its plane [spacing]."),
     Constant("beam_warp.materials.normals:FACE_TURN", ALL, "How far a normal turns to that of a face [rad]."),
     Constant("beam_warp.materials.normals:LEAST_TOWARDS", JUDGED, "An own axis that faces as pixels see."),
-    Constant(EVIDENCE + "LEAST_WEIGHT", BOTH, "Pixels that must show a Gaussian for it to be seen."),
+    Constant(EVIDENCE + "LEAST_WEIGHT", BOTH, "Samples that must show a Gaussian for it to be seen."),
+    Constant("beam_warp.materials.blended_color:SMOOTHNESS", ALL, "What differences between neighbours count."),
+    Constant("beam_warp.materials.blended_color:EDGE", ALL, "Difference of neighbours that is no edge."),
+    Constant("beam_warp.materials.blended_color:PASSES", ALL, "Passes over the views for base colour."),
+    Constant("beam_warp.materials.blended_color:NEIGHBORS", JUDGED, "Gaussians around one that it is compared with."),
+    Constant("beam_warp.materials.blended_color:BRIGHTEST", JUDGED, "Base colour that solving begins with, at most."),
     Constant(EVIDENCE + "LEAST_SHARE", BOTH, "Part of its own pixels that they must be."),
     Constant(EVIDENCE + "LEAST_AGREEMENT", JUDGED, "Agreement of normals below which there is none."),
     Constant(
@@ -519,6 +529,13 @@ MATERIALS = (
         )
     ),
     *(
+        Constant(f"beam_warp.materials.bake_resolution:{name}", chosen_on, does, FINE_PIXELS)
+        for name, chosen_on, does in (
+            ("WIDEST_PIXEL", "ball, figure", "Width of a reduced pixel."),
+            ("SMALL_SPLATS", JUDGED, "Percentile of scales that decides it."),
+        )
+    ),
+    *(
         Constant(place, chosen_on, does, IMAGE_PATH)
         for place, chosen_on, does in (
             ("beam_warp.materials.images:ImagePathOptions.passes", BOTH, "Passes of baking."),
@@ -526,8 +543,6 @@ MATERIALS = (
             ("beam_warp.materials.images:ImagePathOptions.temporal", BOTH, "Pull towards the frame before."),
             ("beam_warp.materials.bake:BakeOptions.tolerance", JUDGED, "Gradient at which baking ends."),
             ("beam_warp.materials.bake:LEARNING_RATE", BOTH, "Step of baking by Adam."),
-            ("beam_warp.materials.bake_resolution:WIDEST_PIXEL", "ball, figure", "Width of a reduced pixel."),
-            ("beam_warp.materials.bake_resolution:SMALL_SPLATS", JUDGED, "Percentile of scales that decides it."),
             ("beam_warp.kernels.trace.joint_bilateral:NORMAL_POWER", BOTH, "Denoiser: fall with normals."),
             ("beam_warp.kernels.trace.joint_bilateral:PLANE_PIXELS", BOTH, "Denoiser: fall with depth."),
             ("beam_warp.kernels.trace.joint_bilateral:VALUE_ERRORS", BOTH, "Denoiser: fall with values."),
@@ -646,7 +661,9 @@ UNTUNED = {
         beam_warp.kernels.reconstruction.silhouettes: MIN_LINES
         beam_warp.kernels.reconstruction.skinning: RUN MESSAGE MOST_JOINTS
         beam_warp.materials.agreement: MATCH_VIEWS MATCH_SIDE SEARCH_VIEWS SEARCH_SIDE SEARCH_GAUSSIANS SOLID SAME
-        beam_warp.materials.bake: MOST_COLUMNS GROUP_SPLATS GROUP_PIXELS LEAST_EVIDENCE CHECK_EVERY
+        beam_warp.materials.bake: MOST_COLUMNS GROUP_SPLATS GROUP_PIXELS LEAST_EVIDENCE
+        beam_warp.materials.bounded_solve: CHECK_EVERY
+        beam_warp.materials.blended_color: COLUMNS
         beam_warp.materials.bake_resolution: MEASURED_SPLATS
         beam_warp.materials.base_color: PAIRED PAIR_GROUPS MISSING
         beam_warp.materials.changes: LEAST_ERROR

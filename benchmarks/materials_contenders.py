@@ -129,6 +129,7 @@ DIRECT_AS_PAPER = Choices(
         ratio=False,
         bounce=False,
         robust=False,
+        blended=False,
         diffuse_weight="fresnel_hv",
     ),
     offset=0.02,
@@ -252,6 +253,7 @@ def ablation_rows(high: int = 512, low: int = 8) -> list[AblationRow]:
         ("+ bounce", {"bounce": True}),
         ("+ fit and difference", {"observed": "difference"}),
         ("+ robust", {"robust": True}),
+        ("+ all Gaussians together", {"blended": True}),
         ("+ rays where light is noisy", {"light_error": MaterialOptions().light_error}),
         ("+ all frames", {"joint": True}),
     ):
@@ -270,6 +272,7 @@ def ablation_rows(high: int = 512, low: int = 8) -> list[AblationRow]:
         ("without bounce", {"bounce": False}),
         ("images for fit and difference", {"observed": "images"}),
         ("plain for robust least squares", {"robust": False}),
+        ("each Gaussian by itself for all together", {"blended": False}),
         ("as many rays for each", {"light_error": 0.0}),
         ("16 rays for each", {"sample_count": 16, "light_error": 0.0}),
         ("256 rays for each", {"sample_count": 256, "light_error": 0.0}),

@@ -27,14 +27,8 @@ from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.common.row_sums import launch_add_rows
 from beam_warp.kernels.materials.baking import launch_add_pull, launch_clamp_rows, launch_weigh_pixels
-from beam_warp.kernels.materials.bounded_solve import (
-    ColumnState,
-    Problem,
-    SolveSums,
-    launch_choose_direction,
-    launch_take_step,
-)
 from beam_warp.kernels.raster.composite import CHANNEL_COUNTS
+from beam_warp.materials.bounded_solve import solve_bounded
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
@@ -271,7 +265,7 @@ class _BlendedImages:
         sums = wp.zeros((self.count, self.width), dtype=float)
         nothing = wp.zeros((self.count, self.width), dtype=float)
         for group in self.groups:
-            self.add_gradient(group, nothing, sums)
+            self.add_pixels_said(group, nothing, sums)
         middle = np.full(evidence.shape, 0.5 * (self.options.low + self.options.high), np.float32)
         means = np.divide(-sums.numpy(), evidence, out=middle, where=evidence > LEAST_EVIDENCE)
         return np.clip(means[:, : self.columns], self.options.low, self.options.high)
@@ -321,7 +315,19 @@ class _BlendedImages:
         self.apply_pixels(values, out)
         launch_add_pull(values.size, values, self._nothing, self.strength, 1.0, out, self.device)
 
-    def add_gradient(self, group: _Group, values: wp.array, out: wp.array) -> None:
+    def scaling(self) -> wp.array:
+        """Return the sums of the rows of A: no eigenvalue is larger, as no entry is negative."""
+        sums = wp.clone(self.evidence)
+        launch_add_rows(self.strength.size, self.strength, sums, self.device)
+        return sums
+
+    def add_gradient(self, values: wp.array, out: wp.array) -> None:
+        """Add half of the objective's gradient."""
+        for group in self.groups:
+            self.add_pixels_said(group, values, out)
+        self.add_pulls(values, 1.0, out)
+
+    def add_pixels_said(self, group: _Group, values: wp.array, out: wp.array) -> None:
         """Add what the pixels of a group say to half of the objective's gradient."""
         self._add_pixels(group, values, group.targets, out)
 
@@ -347,47 +353,13 @@ def _groups(cameras: Sequence[Camera], gaussian_count: int, alone: bool) -> list
     return groups
 
 
-CHECK_EVERY = 5
-"""Passes between looks at the residual, each of which waits for the device."""
-
-
 def _solve_by_gradients(images: _BlendedImages, values: wp.array) -> tuple[float, NDArray[np.float32]]:
-    """Move values to the minimum by modified proportioning, in place."""
-    options, device = images.options, images.device
-    shape = (images.count, images.width)
-    problem = Problem()
-    problem.x = values
-    for name in ("gradient", "walk", "direction", "applied"):
-        setattr(problem, name, wp.zeros(shape, dtype=float))
-    problem.scaling = wp.clone(images.evidence)
-    launch_add_rows(images.strength.size, images.strength, problem.scaling, device)
-    problem.low, problem.high = options.low, options.high
-    state = ColumnState()
-    for name, dtype in (("mode", int), ("step", float), ("clipped", int), ("conjugation", float)):
-        setattr(state, name, wp.zeros(images.width, dtype=dtype))
-    state.curvature = wp.zeros(images.width, dtype=wp.float64)
-    state.residual = wp.zeros(images.width, dtype=float)
-    sums = SolveSums(images.width, device)
-    residuals = wp.zeros((options.passes + 1, images.width), dtype=float)
-
-    for group in images.groups:
-        images.add_gradient(group, values, problem.gradient)
-    images.add_pulls(values, 1.0, problem.gradient)
-    # A step along no direction: it only sums what the first direction depends on.
-    launch_take_step(problem, state, sums, device)
-    launch_choose_direction(problem, state, sums, 0, residuals, device)
-    taken = 0
-    for taken in range(1, options.passes + 1):
-        images.apply(problem.direction, problem.applied)
-        launch_take_step(problem, state, sums, device)
-        launch_choose_direction(problem, state, sums, taken, residuals, device)
-        if taken % CHECK_EVERY == 0 or taken == options.passes:
-            found = residuals.numpy()[: taken + 1]
-            if not (found[-1] > options.tolerance * found[0]).any():
-                break
-    found = residuals.numpy()[: taken + 1]
+    """Move values to the minimum, in place."""
+    options = images.options
+    bounds = options.low, options.high
+    found = solve_bounded(images, values, bounds=bounds, passes=options.passes, tolerance=options.tolerance)
     relative = np.divide(found, found[0], out=np.zeros_like(found), where=found[0] > 0.0)
-    return taken + 2.0, relative
+    return len(found) + 1.0, relative
 
 
 def _solve_by_adam(images: _BlendedImages, values: wp.array) -> tuple[float, NDArray[np.float32]]:
@@ -400,7 +372,7 @@ def _solve_by_adam(images: _BlendedImages, values: wp.array) -> tuple[float, NDA
     for step, place in enumerate(order):
         adam.set_learning_rate("values", LEARNING_RATE * 0.01 ** (step / options.steps))
         gradients.zero_()
-        images.add_gradient(images.groups[place], values, gradients)
+        images.add_pixels_said(images.groups[place], values, gradients)
         images.add_pulls(values, share, gradients)
         adam.step()
         launch_clamp_rows(values.size, options.low, options.high, values, device)

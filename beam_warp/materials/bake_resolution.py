@@ -75,13 +75,17 @@ def reduced_target(target: BakeTarget, factor: int, device: Any) -> BakeTarget:
     """
     if factor == 1:
         return target
-    camera = target.camera
-    width, height = -(-camera.width // factor), -(-camera.height // factor)
-    columns = target.targets.shape[2]
-    means, sums = (wp.empty((height, width, columns), dtype=float, device=device) for _ in range(2))
+    camera = reduced_camera(target.camera, factor)
+    shape = (camera.height, camera.width, target.targets.shape[2])
+    means, sums = (wp.empty(shape, dtype=float, device=device) for _ in range(2))
     launch_reduce_targets(means.size, target.targets, target.weights, factor, means, sums, device)
-    whole = camera.cropped(0, 0, width * factor, height * factor)
-    return BakeTarget(whole.reduced(factor), means, sums)
+    return BakeTarget(camera, means, sums)
+
+
+def reduced_camera(camera: Camera, factor: int) -> Camera:
+    """Return a camera with one pixel for each block of them, those beyond the last whole ones too."""
+    width, height = -(-camera.width // factor), -(-camera.height // factor)
+    return camera.cropped(0, 0, width * factor, height * factor).reduced(factor)
 
 
 def reduced_options(options: RasterOptions, factor: int) -> RasterOptions:

@@ -18,8 +18,16 @@ from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.residues import ColorFit, launch_fit_color
 from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.materials.blended_color import solve_blended
 from beam_warp.materials.evidence import ViewEvidence
-from beam_warp.materials.light_rays import MaterialOptions, light_batches, lit_points, mean_radiance, require_radiance
+from beam_warp.materials.light_rays import (
+    LitPoints,
+    MaterialOptions,
+    light_batches,
+    lit_points,
+    mean_radiance,
+    require_radiance,
+)
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.pilot import economy
 from beam_warp.trace.occlusion import ambient_occlusion
@@ -166,6 +174,9 @@ def measure_materials(
         pass
     fit = zero_struct(ColorFit, len(lit), device)
     launch_fit_color(measured.views, measured.light, measured.surface, options.robust, fit, device)
+    numerator, denominator, observed = (fit.numerator.numpy(), fit.denominator.numpy(), fit.observed.numpy())
+    if views is not None and views.cameras and options.blended and rows is None:
+        numerator, observed = _blended_sums(cloud, views, measured, numerator, denominator, observed)
 
     def by_row(values: NDArray[Any], at_rows: NDArray[np.integer[Any]], otherwise: float = 0.0) -> NDArray[np.float32]:
         """Spread what was measured over all rows that were asked for."""
@@ -180,9 +191,9 @@ def measure_materials(
     if views is not None:
         np.divide(views.misfit[lit], arriving**2, out=misfit, where=arriving > 0.0)
     evidence = ColorEvidence(
-        numerator=by_row(fit.numerator.numpy(), lit),
-        denominator=by_row(fit.denominator.numpy(), lit),
-        observed=by_row(fit.observed.numpy(), lit),
+        numerator=by_row(numerator, lit),
+        denominator=by_row(denominator, lit),
+        observed=by_row(observed, lit),
         irradiance=by_row(np.pi * measured.light.arriving.numpy(), lit),
         openness=by_row(visibility, shown),
         noise=by_row(measured.light.noise.numpy() ** 2 + tilt**2, lit),
@@ -204,6 +215,35 @@ def measure_materials(
             ),
         },
     )
+
+
+def _blended_sums(
+    cloud: GaussianCloud,
+    views: ViewEvidence,
+    measured: LitPoints,
+    numerator: NDArray[np.float32],
+    denominator: NDArray[np.float32],
+    observed: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return sums whose least-squares solution is that of all pixels together; what views leave of it stays as it was.
+
+    Args:
+        cloud: The Gaussians.
+        views: What views with images show of them.
+        measured: Those whose light is known.
+        numerator: Of `ColorEvidence`, of these; so are the others.
+        denominator: Likewise.
+        observed: Likewise.
+
+    Returns:
+        The numerator, and what was observed.
+    """
+    weight = denominator.astype(np.float64)
+    told = (weight > 0.0).all(axis=1, keepdims=True)
+    separate = np.divide(numerator, weight, out=np.full_like(weight, np.nan), where=told & np.ones(3, bool))
+    joint = np.where(told, solve_blended(cloud, views, measured, separate), 0.0)
+    moved = weight * (joint**2 - np.where(told, separate, 0.0) ** 2)
+    return np.where(told, weight * joint, numerator), observed + moved
 
 
 def _cut_radiance(cloud: GaussianCloud) -> NDArray[np.float32]:

@@ -11,8 +11,8 @@ import itertools
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -27,11 +27,11 @@ from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.materials.view_evidence import (
     PIXEL_CHANNELS,
     CapturedPixels,
-    SurfacePixels,
+    SurfaceSamples,
     launch_add_views,
     launch_finish_surface,
     launch_observe,
-    launch_write_pixels,
+    launch_write_samples,
 )
 from beam_warp.kernels.raster.bin_tiles import TILE
 from beam_warp.kernels.raster.project import RasterView
@@ -39,6 +39,7 @@ from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
 from beam_warp.raster.sources import upload_gaussians
+from beam_warp.raster.spacing import samples_of_fit
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -46,7 +47,7 @@ SURFACE_CHANNELS = 11
 """Number of a pixel's channels that are added up over views."""
 
 LEAST_WEIGHT = 0.5
-"""Pixels that all views together must show of a Gaussian, by its blending weights, for it to be seen."""
+"""Samples that all views together must show of a Gaussian, by its blending weights, for it to be seen."""
 
 LEAST_SHARE = 0.01
 """Part of the pixels that it would cover without others before it that they must show: layers let something through,
@@ -56,7 +57,7 @@ LEAST_AGREEMENT = 1e-3
 """Length of the mean of the normals below which it has no direction: both sides of a sheet are seen alike."""
 
 PIXELS_AT_ONCE = 2**21
-"""Most pixels drawn at a time unless one camera has more: 48 bytes each, and as many for what was drawn."""
+"""Most samples drawn at a time unless one camera has more: 48 bytes each, and as many for what was drawn."""
 
 CUTTING_THREADS = 8
 """Images cut at a time."""
@@ -87,6 +88,8 @@ class ViewEvidence:
         directions: Unit, towards each camera, ``(V, N)`` vec3.
         misfit: Mean square of what images differ by from what the Gaussians show, less what their noise makes it, over
             the pixels with an image that show each one, ``(N, 3)`` float32 on the host; 0 where there is none.
+        cameras: Of the views, cut to where Gaussians can be.
+        raster: How splats are drawn.
     """
 
     positions: wp.array
@@ -98,6 +101,8 @@ class ViewEvidence:
     colors: wp.array
     directions: wp.array
     misfit: NDArray[np.float32]
+    cameras: tuple[Camera, ...] = ()
+    raster: RasterOptions = field(default_factory=RasterOptions)
 
 
 class Shown(NamedTuple):
@@ -113,6 +118,7 @@ def view_evidence(
     images: Sequence[CapturedView] | None = None,
     *,
     options: RasterOptions | None = None,
+    samples: int | Literal["auto"] = "auto",
     ceiling: float = float("inf"),
     device: str | None = None,
     progress: CountProgress | None = None,
@@ -128,6 +134,8 @@ def view_evidence(
         cameras: Of any sizes, at least one.
         images: What the cameras saw, one each; None takes the surface alone.
         options: How splats are drawn: as they were fitted.
+        samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: as it was fitted, see
+            `beam_warp.raster.spacing.samples_of_fit`.
         ceiling: Largest value that the images can hold, scene-linear; infinite for scene-referred ones.
         device: Warp device; None takes the first CUDA device, or the CPU.
         progress: Called with (views done, views in all).
@@ -151,18 +159,23 @@ def view_evidence(
     sums = wp.zeros((count, SURFACE_CHANNELS), dtype=float, device=target)
     colors = wp.zeros((observed, count), dtype=wp.vec4, device=target)
     directions = wp.zeros((observed, count), dtype=wp.vec3, device=target)
+    raster = options or RasterOptions()
+    side = samples_of_fit(cloud, cameras, raster) if samples == "auto" else samples
     cut = _cut_to_subject(cloud, cameras, images)
-    for rasterizer, part, shown in _groups(count, cut, options, target):
-        drawn = SurfacePixels()
+    seen_by: list[Camera] = []
+    for rasterizer, part, group in _groups(count, cut, side, raster, target):
+        seen_by += (camera for camera, _ in group)
+        drawn = SurfaceSamples()
         image = rasterizer.draw(gaussians)
         drawn.colors, drawn.alpha, drawn.depth = image.channels[0], image.alpha, image.median_depth
         drawn.display_srgb = int(cloud.radiance_color_space == DISPLAY_SRGB)
         pixels = wp.empty((rasterizer.first_pixels[-1], PIXEL_CHANNELS), dtype=float, device=target)
         rows = wp.empty((len(part) * count, PIXEL_CHANNELS), dtype=float, device=target)
         views = ViewLayout.of(rasterizer.cameras).views
-        for view, image_shown in zip(views, shown, strict=True):
+        for view, (_, image_shown) in zip(views, group, strict=True):
             captured = _captured(image_shown, ceiling, target)
-            launch_write_pixels(view.width * view.height, view, drawn, captured, wp.vec3(*origin), pixels, target)
+            pixel_count = view.width * view.height // side**2
+            launch_write_samples(pixel_count, view, drawn, captured, side, wp.vec3(*origin), pixels, target)
         rasterizer.back_project(pixels, rows)
         launch_add_views(rows, len(part), SURFACE_CHANNELS, sums, target)
         if images is not None:
@@ -182,7 +195,7 @@ def view_evidence(
             progress(part.stop, len(cameras))
     totals = sums.numpy()
     weight, cut = totals[:, 6].copy(), totals[:, 7]
-    seen = weight >= np.maximum(LEAST_WEIGHT, LEAST_SHARE * _coverage(cloud, cameras, origin))
+    seen = weight >= np.maximum(LEAST_WEIGHT / side**2, LEAST_SHARE * _coverage(cloud, cameras, origin))
     seen &= np.linalg.norm(totals[:, 3:6], axis=1) > LEAST_AGREEMENT * weight
     positions, normals = (wp.empty(count, dtype=wp.vec3, device=target) for _ in range(2))
     agreement = wp.empty(count, dtype=float, device=target)
@@ -201,26 +214,28 @@ def view_evidence(
     with_image = colors.numpy()[..., 3].sum(axis=0)[:, None]
     misfit = np.divide(totals[:, 8:], with_image, out=np.zeros_like(totals[:, 8:]), where=with_image > 0.0)
     misfit = np.maximum(misfit, 0.0)
-    return ViewEvidence(positions, normals, agreement, weight, seen, saturated, colors, directions, misfit)
+    return ViewEvidence(
+        positions, normals, agreement, weight, seen, saturated, colors, directions, misfit, tuple(seen_by), raster
+    )
 
 
 def _groups(
-    count: int, views: Iterator[tuple[Camera, Shown | None]], options: RasterOptions | None, device: wp.Device
-) -> Iterator[tuple[Rasterizer, range, list[Shown | None]]]:
-    """Rasterise some views at a time; views of the same sizes share their buffers."""
+    count: int, views: Iterator[tuple[Camera, Shown | None]], samples: int, options: RasterOptions, device: wp.Device
+) -> Iterator[tuple[Rasterizer, range, list[tuple[Camera, Shown | None]]]]:
+    """Rasterise some views at a time, so many samples for a pixel's side; views of the same sizes share buffers."""
     rasterizer: Rasterizer | None = None
     start = 0
     group: list[tuple[Camera, Shown | None]] = []
     for view in itertools.chain(views, (None,)):
         pixels = sum(camera.width * camera.height for camera, _ in group)
-        if group and (view is None or pixels + view[0].width * view[0].height > PIXELS_AT_ONCE):
-            cameras = [camera for camera, _ in group]
+        if group and (view is None or samples**2 * (pixels + view[0].width * view[0].height) > PIXELS_AT_ONCE):
+            cameras = [camera.supersampled(samples) for camera, _ in group]
             sizes = [(camera.width, camera.height) for camera in cameras]
             if rasterizer is not None and [(c.width, c.height) for c in rasterizer.cameras] == sizes:
                 rasterizer.set_cameras(cameras)
             else:
                 rasterizer = Rasterizer(count, cameras, radiance=True, normals=True, options=options, device=device)
-            yield rasterizer, range(start, start + len(group)), [image for _, image in group]
+            yield rasterizer, range(start, start + len(group)), group
             start += len(group)
             group = []
         if view is not None:

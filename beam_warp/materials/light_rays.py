@@ -87,6 +87,8 @@ class MaterialOptions:
         density: What light rays are drawn by; see there.
         ratio: Whether rays only say which share of the unshadowed light arrives; see there.
         robust: Count views little that disagree with the others.
+        blended: Solve for base colour by what pixels say of all Gaussians together, and of neighbours; else each by
+            itself. See `beam_warp.materials.blended_color`. Only where there are images, and all are measured.
         seed: Same seed, same device, same bits.
 
     Raises:
@@ -102,6 +104,7 @@ class MaterialOptions:
     density: Density = "product"
     ratio: bool = True
     robust: bool = True
+    blended: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -22,15 +22,13 @@ from beam_warp.kernels.reconstruction.seen_colors import SeenImage, launch_agree
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays
+from beam_warp.raster.spacing import DISC_WIDTH
 from beam_warp.reconstruction.hull import VisualHull, masked_views, viewing_focus, visual_hull
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
 from beam_warp.world.harmonics import SH_C0
 
 if TYPE_CHECKING:
     import trimesh
-
-DISC_WIDTH = 0.7
-"""Standard deviation across a disc, in spacings: neighbours overlap, so that light does not pass between them."""
 
 DISC_THICKNESS = 0.15
 """Standard deviation of a disc along its normal, in spacings: a surface to the eye, with room to learn

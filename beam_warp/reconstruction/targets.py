@@ -31,7 +31,7 @@ from beam_warp.raster.depth_normals import DepthNormals
 from beam_warp.raster.losses import L1Loss, NormalLoss, SsimLoss
 from beam_warp.raster.rasterizer import PreparedCameras, Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.reconstruction.initial import DISC_WIDTH
+from beam_warp.raster.spacing import disc_spacing, sample_side
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -43,12 +43,6 @@ CROP_STEP = 16
 
 MATTE_SHARE = 0.4
 """Part of the weight of coverage that counts where the backdrop is known: the photograph says what a matte guesses."""
-
-MOST_SAMPLES = 4
-"""Largest side of the square of samples of a pixel."""
-
-SAMPLES_PER_SPACING = 2.0
-"""Samples that fall on the distance of neighbouring Gaussians, unless `MOST_SAMPLES` are fewer."""
 
 
 @dataclass(frozen=True)
@@ -485,33 +479,8 @@ def shuffled_views(rng: np.random.Generator, view_count: int, steps: int) -> NDA
     return np.concatenate([rng.permutation(view_count) for _ in range(rounds)])
 
 
-def disc_spacing(cloud: GaussianCloud) -> float:
-    """Return the distance of neighbouring discs [m], from the median of their second largest deviations."""
-    return float(np.median(np.sort(cloud.scales, axis=1)[:, 1])) / DISC_WIDTH
-
-
 def chosen_samples(samples: int | Literal["auto"], cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
-    """Return the side of the square of samples of a pixel; `sample_side` chooses it where it is ``"auto"``."""
+    """Return the side of the square of samples of a pixel; ``"auto"`` is what `beam_warp.raster.spacing` asks for."""
     if samples != "auto":
         return int(samples)
-    return sample_side(views, np.median(cloud.positions, axis=0), disc_spacing(cloud))
-
-
-def sample_side(views: Sequence[CapturedView], center: NDArray[np.floating], spacing: float) -> int:
-    """Return how many samples a pixel's side needs, so that two fall on the distance of neighbouring Gaussians.
-
-    At silhouettes many layers lie behind each other, so that their blurred edges are opaque further out than half of
-    the blur, and what is fitted shrinks to make up for it, by half a pixel. Samples finer than the Gaussians keep that
-    below their own size.
-
-    Args:
-        views: What is fitted.
-        center: Middle of the subject [m], ``(3,)``.
-        spacing: Distance of neighbouring Gaussians [m].
-    """
-    footprints = [float((center - view.camera.position) @ view.camera.forward) / view.camera.focal_x for view in views]
-    footprint = float(np.median(footprints))
-    if not footprint > 0.0:
-        return 1
-    needed = SAMPLES_PER_SPACING * footprint
-    return int(np.ceil(needed / spacing)) if MOST_SAMPLES * spacing > needed else MOST_SAMPLES
+    return sample_side([view.camera for view in views], np.median(cloud.positions, axis=0), disc_spacing(cloud))

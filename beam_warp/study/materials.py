@@ -152,7 +152,7 @@ _SENTENCES = {
     "ratio": "ratio: exact unshadowed light times a ratio of two estimates. plain: one estimate.",
     "bounce": "Light from other surfaces, by their captured radiance.",
     "weight": "What the specular lobe leaves for diffusion.",
-    "fit": "robust: views that disagree with the others count little.",
+    "fit": "together: as pixels blend all Gaussians; robust: each by itself, views that disagree count little.",
     "observed": "difference: fitted radiance plus what images show beside it. images: images spread back.",
     "denoiser": "Of the path by images; auto is Open Image Denoise where it is installed.",
 }
@@ -271,7 +271,8 @@ class _Bench:
             "ratio": settings["ratio"] == "ratio",
             "bounce": settings["bounce"] == "one",
             "diffuse_weight": settings["weight"],
-            "robust": settings["fit"] == "robust",
+            "robust": settings["fit"] != "plain",
+            "blended": settings["fit"] == "together",
             "seed": seed,
         }
         measured = measure_materials(

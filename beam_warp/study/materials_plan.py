@@ -15,7 +15,7 @@ from beam_warp.trace.sampling import SAMPLERS
 
 PATHS = ("direct", "images")
 BOUNCES = ("one", "none")
-FITS = ("robust", "plain")
+FITS = ("together", "robust", "plain")
 OBSERVED = ("difference", "images")
 
 DIRECT_AXES = ("sampler", "offset", "density", "ratio", "bounce", "weight", "fit", "observed")
@@ -34,7 +34,8 @@ class MaterialsPlan:
         ratios: Light as a ratio of estimates (``ratio``) or as one estimate (``plain``).
         bounces: Light from other surfaces: ``one`` bounce or ``none``.
         weights: What the specular lobe leaves for diffusion.
-        fits: Whether views that disagree with the others count little (``robust``) or as they are (``plain``).
+        fits: All Gaussians ``together``, as pixels blend them; or each by itself, where views that disagree with the
+            others count little (``robust``) or as they are (``plain``).
         observed: What views show of a Gaussian: its fitted radiance plus the ``difference`` to the image, spread back,
             or the ``images`` themselves spread back.
         denoisers: Denoisers of the path by images.

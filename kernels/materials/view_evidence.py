@@ -1,8 +1,9 @@
 """Evidence that the pixels of views give on the Gaussians that they show: place, normal and colour of the surface.
 
-Pixels carry sums to be spread back over Gaussians by their blending weights: 0-2 place relative to an origin, 3-5
-normal, 6 weight of both; 7 weight of saturated pixels; 8-10 square of what follows, less what noise makes it; 11-13
-captured colour less the rendered one, 14 its weight. 15 is not used: pixels are moved by four numbers at a time.
+Samples of pixels carry sums to be spread back over Gaussians by their blending weights: 0-2 place relative to an
+origin, 3-5 normal, 6 weight of both; 7 weight of saturated pixels; 8-10 square of what follows, less what noise makes
+it; 11-13 captured colour less the rendered one, 14 its weight. 15 is not used: samples are moved by four numbers at a
+time. A photograph shows the mean over a pixel, so that is compared with the mean of a pixel's samples.
 """
 
 import warp as wp
@@ -23,8 +24,8 @@ LEAST_COVERAGE = wp.constant(0.99)
 
 
 @wp.struct
-class SurfacePixels:
-    """Radiance, normal, coverage and depth of the pixels that a rasteriser drew, one view after the other."""
+class SurfaceSamples:
+    """Radiance, normal, coverage and depth of the samples that a rasteriser drew, one view after the other."""
 
     colors: wp.array2d[float]  # radiance in columns 0-2, normals in 3-5, sums weighted by visibility
     alpha: wp.array[float]
@@ -42,47 +43,75 @@ class CapturedPixels:
     noise: float  # variance of a pixel over its value
 
 
+@wp.func
+def rendered_color(view: RasterView, drawn: SurfaceSamples, column: int, row: int, side: int) -> wp.vec4:
+    """Mean of a pixel's samples, scene-linear, and of their coverage."""
+    total = wp.vec4()
+    for j in range(side):
+        for i in range(side):
+            sample = view.first_pixel + (row * side + j) * view.width + column * side + i
+            for c in range(3):
+                shown = wp.max(drawn.colors[sample, c], 0.0)
+                if drawn.display_srgb == 1:
+                    shown = srgb_to_linear(wp.min(shown, 1.0))
+                total[c] = total[c] + shown
+            total[3] = total[3] + drawn.alpha[sample]
+    return total / float(side * side)
+
+
 @wp.kernel
-def write_pixels_kernel(
+def write_samples_kernel(
     first: int,
     view: RasterView,
-    drawn: SurfacePixels,
+    drawn: SurfaceSamples,
     captured: CapturedPixels,
+    side: int,
     origin: wp.vec3,
-    out_pixels: wp.array2d[float],
+    out_samples: wp.array2d[float],
 ):
-    local = first + wp.tid()
-    pixel = view.first_pixel + local
-    for c in range(16):
-        out_pixels[pixel, c] = 0.0
-    alpha = drawn.alpha[pixel]
-    if not (alpha > LEAST_SURFACE_ALPHA):
-        return
-    x = (float(local % view.width) + 0.5 - view.center[0]) / view.focal[0]
-    y = (float(local / view.width) + 0.5 - view.center[1]) / view.focal[1]
-    ray = wp.transpose(view.world_to_camera) * wp.vec3(x, y, 1.0)
-    place = (view.position - origin) + ray * drawn.depth[pixel]
-    normal = wp.normalize(wp.vec3(drawn.colors[pixel, 3], drawn.colors[pixel, 4], drawn.colors[pixel, 5]))
-    for c in range(3):
-        out_pixels[pixel, c] = place[c]
-        out_pixels[pixel, 3 + c] = normal[c]
-    out_pixels[pixel, 6] = 1.0
-    if captured.color.shape[0] == 0:
-        return
-    if captured.coverage.shape[0] > 0:
-        if not (captured.coverage[local] > LEAST_COVERAGE):
-            return
-    color = captured.color[local]
-    if wp.max(color[0], wp.max(color[1], color[2])) >= captured.ceiling:
-        out_pixels[pixel, 7] = 1.0
-        return
-    for c in range(3):
-        rendered = wp.max(drawn.colors[pixel, c], 0.0)
-        if drawn.display_srgb == 1:
-            rendered = srgb_to_linear(wp.min(rendered, 1.0))
-        out_pixels[pixel, 8 + c] = (color[c] - rendered) * (color[c] - rendered) - captured.noise * rendered
-        out_pixels[pixel, 11 + c] = color[c] - rendered
-    out_pixels[pixel, 14] = 1.0
+    """A pixel's samples, ``side`` in each direction, together."""
+    pixel = first + wp.tid()
+    column = pixel % (view.width / side)
+    row = pixel / (view.width / side)
+    share = 1.0 / float(side * side)
+    rendered = rendered_color(view, drawn, column, row, side)
+    says = int(0)
+    cut = float(0.0)
+    color = wp.vec3()
+    if captured.color.shape[0] > 0 and rendered[3] > LEAST_SURFACE_ALPHA:
+        says = 1
+        if captured.coverage.shape[0] > 0:
+            says = wp.where(captured.coverage[pixel] > LEAST_COVERAGE, 1, 0)
+        color = captured.color[pixel]
+        if says == 1 and wp.max(color[0], wp.max(color[1], color[2])) >= captured.ceiling:
+            cut = share
+            says = 0
+    for j in range(side):
+        for i in range(side):
+            x = column * side + i
+            y = row * side + j
+            sample = view.first_pixel + y * view.width + x
+            for c in range(16):
+                out_samples[sample, c] = 0.0
+            if drawn.alpha[sample] > LEAST_SURFACE_ALPHA:
+                right = (float(x) + 0.5 - view.center[0]) / view.focal[0]
+                down = (float(y) + 0.5 - view.center[1]) / view.focal[1]
+                ray = wp.transpose(view.world_to_camera) * wp.vec3(right, down, 1.0)
+                place = (view.position - origin) + ray * drawn.depth[sample]
+                normal = wp.normalize(
+                    wp.vec3(drawn.colors[sample, 3], drawn.colors[sample, 4], drawn.colors[sample, 5])
+                )
+                for c in range(3):
+                    out_samples[sample, c] = share * place[c]
+                    out_samples[sample, 3 + c] = share * normal[c]
+                out_samples[sample, 6] = share
+                out_samples[sample, 7] = cut
+                if says == 1:
+                    for c in range(3):
+                        off = color[c] - rendered[c]
+                        out_samples[sample, 8 + c] = share * (off * off - captured.noise * rendered[c])
+                        out_samples[sample, 11 + c] = share * off
+                    out_samples[sample, 14] = share
 
 
 @wp.kernel
@@ -153,8 +182,8 @@ def finish_surface_kernel(
     out_agreement[i] = agreement
 
 
-launch_write_pixels = launcher(write_pixels_kernel)
-"""Write what one view's pixels say."""
+launch_write_samples = launcher(write_samples_kernel)
+"""Write what one view's pixels say of their samples."""
 
 
 def launch_add_views(rows, view_count, columns, out_sums, device):

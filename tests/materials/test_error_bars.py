@@ -89,11 +89,21 @@ def model(points, normals, ball_count, base_color, cameras):
     return sent
 
 
-@pytest.fixture(scope="module")
-def decomposed():
+def painted(points, rng, is_patched):
+    """Base colours at random: each point has its own, or patches half a unit wide have."""
+    if not is_patched:
+        return rng.uniform(0.02, 0.9, (len(points), 3))
+    patch = np.floor(2.0 * points).astype(int)
+    return rng.uniform(0.02, 0.9, (8, 8, 8, 3))[tuple((patch + 4).T)]
+
+
+@pytest.fixture(scope="module", params=["each by itself", "all together"])
+def decomposed(request):
+    """Neighbours that have nothing in common are no subject for a solution that takes them to be alike."""
+    together = request.param == "all together"
     rng = np.random.default_rng(1)
     cloud, points, normals, ball_count = shape()
-    truth = rng.uniform(0.02, 0.9, (len(points), 3))
+    truth = painted(points, rng, together)
     height = (np.arange(VIEWS) + 0.5) / VIEWS * 0.9 + 0.1  # all before the wall, which has but one side
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(VIEWS)
     side = np.sqrt(1.0 - height**2)
@@ -113,7 +123,8 @@ def decomposed():
     scene = Scene.from_gaussians(cloud, "cpu")
     surface = SurfacePoints.seen_by(cloud, evidence, scene)
     light = PreparedEnvironment(sky(), wp.get_device("cpu"))
-    rough, options = np.full(len(cloud), ROUGHNESS, np.float32), MaterialOptions(bounce=False)  # the model has none
+    rough = np.full(len(cloud), ROUGHNESS, np.float32)
+    options = MaterialOptions(bounce=False, blended=together)  # the model has no bounce
     measured = measure_materials(cloud, scene, surface, rough, light, options=options, views=evidence)
     known = cloud.with_arrays(normal_confidence=surface.confidence)
     solved = solve_base_color(known, measured.evidence, light.mean_irradiance)

@@ -12,6 +12,7 @@ from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
+from beam_warp.image.metrics import block_means
 from beam_warp.kernels.materials.neighborhoods import (
     FaceRule,
     launch_judge_faces,
@@ -22,6 +23,8 @@ from beam_warp.materials.evidence import RADII, view_evidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.channels import RADIANCE
 from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.spacing import samples_of_fit
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT
@@ -287,6 +290,30 @@ class TestColors:
         colors, shown = shown_colors(ball, cameras, views, device=device)
         truth = np.broadcast_to(0.5 + more + SH_C0 * ball.radiance[:, 0], colors[..., :3].shape)
         np.testing.assert_allclose(colors[shown][:, :3], truth[shown], atol=tolerance)
+
+    def test_a_pixel_is_the_mean_of_its_samples(self, device, rng):
+        """Tiles finer than pixels: a photograph shows means, which a sample a pixel does not."""
+        points, spacing = sphere_points(12000)
+        ball = colored(cloud_of(tiles(points, points, spacing)), rng.uniform(0.1, 0.9, (12000, 3)))
+        raster, cameras, views = RasterOptions(antialiased=True, low_pass=0.1), around(4), []
+        side = samples_of_fit(ball, cameras, raster)
+        assert side > 1
+        for k, camera in enumerate(cameras):
+            drawn = rasterize(ball, camera.supersampled(side), channels=(RADIANCE,), options=raster, device=device)
+            color = block_means(drawn.channels[RADIANCE] * drawn.alpha[..., None], side).astype(np.float32)
+            alpha = block_means(drawn.alpha, side).astype(np.float32)
+            views.append(CapturedView(name=str(k), camera=camera, color=color, alpha=np.minimum(alpha, 1.0)))
+        truth = 0.5 + SH_C0 * ball.radiance[:, 0]
+        off = {}
+        for samples in (side, 1, "auto"):
+            found = view_evidence(ball, cameras, views, options=raster, samples=samples, device=device)
+            colors = found.colors.numpy()
+            shown = colors[..., 3] > 0.1
+            off[samples] = np.abs(colors[..., :3] - truth)[shown]
+            assert 0.8 < found.weight.sum() / sum(view.alpha.sum() for view in views) < 1.0  # pixels, not samples
+        assert off[side].max() < 2e-4
+        assert off[1].max() > 0.02
+        np.testing.assert_array_equal(off["auto"], off[side])
 
     def test_colours_are_those_that_each_camera_sees(self, ball, device, rng):
         """Harmonics of degree 3 are evaluated along the way from the camera: the other side shows other colours."""

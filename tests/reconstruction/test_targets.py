@@ -24,12 +24,10 @@ from beam_warp.reconstruction.targets import (
     CROP_MARGIN,
     CROP_STEP,
     MATTE_SHARE,
-    MOST_SAMPLES,
     LossWeights,
     TargetSet,
     ViewTargets,
     crop_views,
-    sample_side,
 )
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -385,18 +383,3 @@ def test_room_is_made_when_more_is_drawn(device):
     assert is_new
     fresh = TargetSet(ball_views(rig(2)), 60, RASTER, 1, targets.device)
     np.testing.assert_array_equal(psnr, fresh.make_room(parameters.drawn)[0])  # nothing was left out for lack of room
-
-
-class TestSampleSide:
-    def test_two_samples_on_the_distance_of_neighbours(self):
-        """Cameras 2.5 m away: a pixel is 2.5 / focal length wide."""
-        views = ball_views(rig(3))
-        pixel = 2.5 / views[0].camera.focal_x
-        middle = np.zeros(3)
-        for spacing, side in ((3.0, 1), (2.0001, 1), (1.9, 2), (0.7, 3), (0.01, MOST_SAMPLES)):
-            assert sample_side(views, middle, spacing * pixel) == side
-
-    def test_cameras_that_look_away_take_one_sample(self):
-        views = ball_views(rig(1))
-        behind = views[0].camera.position - views[0].camera.forward
-        assert sample_side(views, behind, 0.1) == 1
