@@ -127,7 +127,7 @@ RECONSTRUCTION = (
     Constant("beam_warp.reconstruction.densify:SPLIT_OFFSET", WALKER, "How far halves go apart, in deviations."),
     Constant("beam_warp.reconstruction.densify:SPLIT_SHRINK", WALKER, "How long a half is.", most=1.0),
     Constant(
-        "beam_warp.raster.spacing:DISC_WIDTH",
+        "beam_warp.raster.resolution:DISC_WIDTH",
         WALKER,
         "Deviation of the first discs, in spacings; also the unit of samples.",
     ),
@@ -154,8 +154,8 @@ RECONSTRUCTION = (
     ),
     Constant(SEEN_COLORS + "LEAST_COVERAGE", JUDGED, "Coverage below which a pixel's colour does not count.", most=1.0),
     Constant("beam_warp.reconstruction.targets:MATTE_SHARE", ALL, "Coverage's weight before a backdrop.", EXACT_MASKS),
-    Constant("beam_warp.raster.spacing:SAMPLES_PER_SPACING", WALKER, "Samples on the distance of neighbours."),
-    Constant("beam_warp.raster.spacing:MOST_SAMPLES", WALKER, "Largest side of a pixel's square of samples."),
+    Constant("beam_warp.raster.resolution:SAMPLES_PER_SPACING", WALKER, "Samples on the distance of neighbours."),
+    Constant("beam_warp.raster.resolution:MOST_SAMPLES", WALKER, "Largest side of a pixel's square of samples."),
     Constant("beam_warp.reconstruction.targets:CROP_MARGIN", JUDGED, "Pixels around the subject that are looked at."),
     Constant("beam_warp.reconstruction.hull:AUTO_RESOLUTION", JUDGED, "Least and most voxels along the visual hull."),
     Constant("beam_warp.reconstruction.hull:VOXEL_PIXELS", JUDGED, "Pixels across a voxel."),
@@ -529,7 +529,7 @@ MATERIALS = (
         )
     ),
     *(
-        Constant(f"beam_warp.materials.bake_resolution:{name}", chosen_on, does, FINE_PIXELS)
+        Constant(f"beam_warp.raster.resolution:{name}", chosen_on, does, FINE_PIXELS)
         for name, chosen_on, does in (
             ("WIDEST_PIXEL", "ball, figure", "Width of a reduced pixel."),
             ("SMALL_SPLATS", JUDGED, "Percentile of scales that decides it."),
@@ -664,7 +664,6 @@ UNTUNED = {
         beam_warp.materials.bake: MOST_COLUMNS GROUP_SPLATS GROUP_PIXELS LEAST_EVIDENCE
         beam_warp.materials.bounded_solve: CHECK_EVERY
         beam_warp.materials.blended_color: COLUMNS
-        beam_warp.materials.bake_resolution: MEASURED_SPLATS
         beam_warp.materials.base_color: PAIRED PAIR_GROUPS MISSING
         beam_warp.materials.changes: LEAST_ERROR
         beam_warp.materials.evidence: SURFACE_CHANNELS PIXELS_AT_ONCE CUTTING_THREADS MARGIN

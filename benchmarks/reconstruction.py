@@ -47,12 +47,12 @@ from beam_warp.demo.capture import write_demo_capture
 from beam_warp.device.arrays import resolve_device
 from beam_warp.mesh.distances import SAMPLE_COUNT
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import MOST_SAMPLES
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.joints.image_motion import motion_in_pixels
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, truth_frames
-from beam_warp.reconstruction.targets import MOST_SAMPLES
 from beam_warp.reconstruction.track import TrackOptions
 from beam_warp.stability.capture_cases.alterations import evenly, training_cameras, with_cameras
 

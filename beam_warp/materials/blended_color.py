@@ -38,11 +38,11 @@ from beam_warp.kernels.materials.blended_color import (
     launch_write_explained,
     launch_write_unexplained,
 )
-from beam_warp.materials.bake_resolution import reduced_camera, reduced_options, reduction_factor
 from beam_warp.materials.bounded_solve import solve_bounded
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.light_rays import LitPoints
 from beam_warp.raster.rasterizer import Rasterizer
+from beam_warp.raster.resolution import reduced_camera, reduced_options, reduction_factor
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.world.gaussians import GaussianCloud
 

@@ -38,8 +38,8 @@ from beam_warp.kernels.raster.project import RasterView
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import samples_of_fit
 from beam_warp.raster.sources import upload_gaussians
-from beam_warp.raster.spacing import samples_of_fit
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -135,7 +135,7 @@ def view_evidence(
         images: What the cameras saw, one each; None takes the surface alone.
         options: How splats are drawn: as they were fitted.
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: as it was fitted, see
-            `beam_warp.raster.spacing.samples_of_fit`.
+            `beam_warp.raster.resolution.samples_of_fit`.
         ceiling: Largest value that the images can hold, scene-linear; infinite for scene-referred ones.
         device: Warp device; None takes the first CUDA device, or the CPU.
         progress: Called with (views done, views in all).

@@ -38,7 +38,7 @@ from beam_warp.jobs.progress import StageTimer
 from beam_warp.kernels.materials.base_color_pixels import PixelGuards, ShownPixels, launch_write_bake_targets
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.bake import BakedValues, BakeOptions, BakeTarget, Solver, bake
-from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
+from beam_warp.materials.bake_resolution import reduced_target
 from beam_warp.materials.base_color import Neighbors
 from beam_warp.materials.light_rays import DIFFUSE_WEIGHTS, DiffuseWeight
 from beam_warp.materials.residues import (
@@ -50,6 +50,7 @@ from beam_warp.materials.residues import (
     view_surfaces,
 )
 from beam_warp.raster.records import GaussianArrays, RasterOptions
+from beam_warp.raster.resolution import reduced_options, reduction_factor
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.trace.denoise import DENOISERS, Denoiser, NoisyImage, SurfaceGuides, chosen_denoiser, denoise
 from beam_warp.trace.occlusion import ambient_occlusion

@@ -28,7 +28,7 @@ from beam_warp.jobs.listeners import no_progress
 from beam_warp.kernels.reconstruction.gradient_sums import launch_add_gradient_lengths
 from beam_warp.raster.adam import Adam
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.spacing import disc_spacing
+from beam_warp.raster.resolution import disc_spacing
 from beam_warp.reconstruction.densify import hidden, refine, with_more_rows
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.parameters import GaussianParameters, require_something
@@ -138,7 +138,7 @@ class FitOptions:
         rates: Sizes of steps.
         sh_degree: Degree of the captured radiance.
         samples: Side of the square of samples that a pixel is the mean of; ``"auto"``: see
-            `beam_warp.raster.spacing.sample_side`.
+            `beam_warp.raster.resolution.sample_side`.
         raster: How splats are drawn.
         sampling_filter: Whether Gaussians are kept as wide as what the views can show (Mip-Splatting's 3D filter).
         temporal: Weight of changes against the start, for the frames after the first (E_temp).

@@ -22,7 +22,7 @@ from beam_warp.kernels.reconstruction.seen_colors import SeenImage, launch_agree
 from beam_warp.raster.layout import ViewLayout
 from beam_warp.raster.rasterizer import Rasterizer
 from beam_warp.raster.records import GaussianArrays
-from beam_warp.raster.spacing import DISC_WIDTH
+from beam_warp.raster.resolution import DISC_WIDTH
 from beam_warp.reconstruction.hull import VisualHull, masked_views, viewing_focus, visual_hull
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud
 from beam_warp.world.harmonics import SH_C0

@@ -31,7 +31,7 @@ from beam_warp.raster.depth_normals import DepthNormals
 from beam_warp.raster.losses import L1Loss, NormalLoss, SsimLoss
 from beam_warp.raster.rasterizer import PreparedCameras, Rasterizer
 from beam_warp.raster.records import GaussianArrays, RasterOptions
-from beam_warp.raster.spacing import disc_spacing, sample_side
+from beam_warp.raster.resolution import disc_spacing, sample_side
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
 
@@ -480,7 +480,7 @@ def shuffled_views(rng: np.random.Generator, view_count: int, steps: int) -> NDA
 
 
 def chosen_samples(samples: int | Literal["auto"], cloud: GaussianCloud, views: Sequence[CapturedView]) -> int:
-    """Return the side of the square of samples of a pixel; ``"auto"`` is what `beam_warp.raster.spacing` asks for."""
+    """Return the side of the square of samples of a pixel; ``"auto"``: what `beam_warp.raster.resolution` asks for."""
     if samples != "auto":
         return int(samples)
     return sample_side([view.camera for view in views], np.median(cloud.positions, axis=0), disc_spacing(cloud))

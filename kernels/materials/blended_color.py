@@ -50,7 +50,7 @@ def diffuse_light(lit: LitView, point: int) -> wp.vec3:
 def write_unexplained_kernel(
     first: int, lit: LitView, colors: wp.array2d[wp.vec4], x: wp.array2d[float], out_values: wp.array2d[float]
 ):
-    """For every Gaussian y - D x, and the mean of the channels of what is explained; all is, of those in no light."""
+    """Unexplained is y - D x; then the mean of the channels of what is explained: all, of Gaussians in no light."""
     gaussian = first + wp.tid()
     point = lit.points[gaussian]
     color = colors[lit.view, gaussian]
@@ -66,7 +66,7 @@ def write_unexplained_kernel(
 
 @wp.kernel
 def write_explained_kernel(first: int, lit: LitView, x: wp.array2d[float], out_values: wp.array2d[float]):
-    """For every Gaussian D x; 0 for those in no light."""
+    """Explained is D x: nothing of Gaussians in no light."""
     gaussian = first + wp.tid()
     point = lit.points[gaussian]
     explained = wp.vec4()

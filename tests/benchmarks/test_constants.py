@@ -19,7 +19,7 @@ from constants_registry import GROUPS, SIDES, UNTUNED, Constant, untuned_places
 from beam_warp.materials.bake import BakeOptions
 from beam_warp.materials.images import ImagePathOptions
 from beam_warp.materials.light_rays import MaterialOptions
-from beam_warp.raster import spacing
+from beam_warp.raster import resolution
 from beam_warp.reconstruction import densify, initial
 from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.job import ReconstructOptions
@@ -106,10 +106,10 @@ def test_values_are_scaled_in_their_own_kind():
 
 def test_a_changed_number_reaches_its_copies_and_comes_back():
     """Modules that imported it see the other one; a default is another one in calls; kernels are no longer the same."""
-    place = "beam_warp.raster.spacing:DISC_WIDTH"
+    place = "beam_warp.raster.resolution:DISC_WIDTH"
     with changed(place, 0.1):
-        assert (initial.DISC_WIDTH, spacing.DISC_WIDTH) == (0.1, 0.1)
-    assert initial.DISC_WIDTH == spacing.DISC_WIDTH != 0.1
+        assert (initial.DISC_WIDTH, resolution.DISC_WIDTH) == (0.1, 0.1)
+    assert initial.DISC_WIDTH == resolution.DISC_WIDTH != 0.1
 
     points = np.random.default_rng(0).normal(size=(40, 3))
     with changed("beam_warp.reconstruction.joints.graph:JointGraph.build(neighbor_count)", 3):

@@ -10,9 +10,10 @@ from support.shapes import cloud_of, sphere_points, tiles
 from beam_warp import Camera
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.materials.bake import BakeTarget
-from beam_warp.materials.bake_resolution import reduced_options, reduced_target, reduction_factor
+from beam_warp.materials.bake_resolution import reduced_target
 from beam_warp.raster.gbuffer import rasterize_values
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import reduced_options, reduction_factor
 
 NEAR = 0.01
 

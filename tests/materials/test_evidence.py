@@ -24,7 +24,7 @@ from beam_warp.materials.normals import SurfacePoints
 from beam_warp.raster.channels import RADIANCE
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.spacing import samples_of_fit
+from beam_warp.raster.resolution import samples_of_fit
 from beam_warp.trace.occlusion import ambient_occlusion
 from beam_warp.trace.scene import Scene
 from beam_warp.trace.transmittance import EXACT

@@ -12,11 +12,12 @@ from support.threads import require_same_on_any_threads
 from beam_warp.capture.quality import noise_of_views
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.jobs.listeners import no_progress
+from beam_warp.raster.resolution import MOST_SAMPLES
 from beam_warp.reconstruction import fit as fit_module
 from beam_warp.reconstruction.fit import PRESETS, FitOptions, Fitter, LearningRates, chosen_dropout, fit_gaussians
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.parameters import GaussianParameters
-from beam_warp.reconstruction.targets import MOST_SAMPLES, LossWeights
+from beam_warp.reconstruction.targets import LossWeights
 from beam_warp.reconstruction.total_variation import RadianceVariation
 
 

@@ -5,7 +5,7 @@ import pytest
 from support.shapes import cloud_of, sphere_points, tiles
 
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.spacing import DISC_WIDTH, MOST_SAMPLES, disc_spacing, sample_side, samples_of_fit
+from beam_warp.raster.resolution import DISC_WIDTH, MOST_SAMPLES, disc_spacing, sample_side, samples_of_fit
 from beam_warp.world.camera import Camera
 
 MIDDLE = np.zeros(3)
