@@ -74,6 +74,7 @@ def draw_ablation(part: Row, path: Path) -> None:
         ):
             _bars(axes, labels if axes is line[0] else [""] * len(labels), values, colors)
             axes.set_title(f"{name}: {title}", fontsize=10)
+            axes.set_ylim(len(rows) - 0.4, -0.6)  # also where the last rows have no bar
             if np.isfinite(values).any():
                 low, high = np.nanmin(values), np.nanmax(values)
                 axes.set_xlim(low - 0.1 * (high - low) - 0.01, high + 0.12 * (high - low) + 0.01)
