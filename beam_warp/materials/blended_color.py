@@ -82,11 +82,9 @@ def solve_blended(
     if known.sum() < 2:
         return np.asarray(separate, np.float32)
     start = np.clip(np.where(known[:, None], separate, 0.0), 0.0, BRIGHTEST).astype(np.float32)
-    blends = _BlendedViews(cloud, views, measured, start, known)
+    values = upload(np.pad(start, ((0, 0), (0, COLUMNS - 3))), float, measured.surface.normals.device)
+    blends = _BlendedViews(cloud, views, measured, values, known)
     blends.connect(_connections(cloud.positions[measured.rows], start, known, blends.typical_worth()))
-    rows = np.zeros((len(start), COLUMNS), np.float32)
-    rows[:, :3] = start
-    values = upload(rows, float, blends.device)
     solve_bounded(blends, values, bounds=(-np.inf, np.inf), passes=PASSES, tolerance=0.0)
     return np.where(known[:, None], values.numpy()[:, :3], np.nan).astype(np.float32)
 
@@ -113,15 +111,10 @@ class _BlendedViews:
     """The problem as `beam_warp.materials.bounded_solve` takes it; a view is drawn at a time."""
 
     def __init__(
-        self,
-        cloud: GaussianCloud,
-        views: ViewEvidence,
-        measured: LitPoints,
-        start: NDArray[np.float32],
-        known: NDArray[np.bool_],
+        self, cloud: GaussianCloud, views: ViewEvidence, measured: LitPoints, start: wp.array, known: NDArray[np.bool_]
     ) -> None:
-        """Draw every view once, and find what its pixels count and say of the start."""
-        self.device = device = measured.surface.normals.device
+        """Draw every view once, and find what its pixels count and say of the start, ``(M, COLUMNS)``."""
+        self.device = device = start.device
         count, points = len(cloud), len(measured.rows)
         self._values = wp.zeros((count, COLUMNS), dtype=float, device=device)
         self._rows = wp.empty((count, COLUMNS), dtype=float, device=device)
@@ -142,13 +135,11 @@ class _BlendedViews:
         }
         largest = max(cameras, key=lambda camera: camera.width * camera.height)
         room = Rasterizer(count, [largest], **how)  # all views draw into its images
-        self._start = wp.zeros((points, COLUMNS), dtype=float, device=device)
         self._gradient, self._worth = (wp.zeros((points, COLUMNS), dtype=float, device=device) for _ in range(2))
-        self._start.assign(np.pad(start, ((0, 0), (0, COLUMNS - 3))))
         self._views: list[tuple[Rasterizer, wp.array]] = []
         for index, camera in enumerate(cameras):
             lit.view = index
-            launch_write_unexplained(count, lit, views.colors, self._start, self._values, device)
+            launch_write_unexplained(count, lit, views.colors, start, self._values, device)
             rasterizer = Rasterizer(count, [camera], images_of=room, **how)
             pixels = rasterizer.draw(gaussians).channels[0]
             weights = wp.empty(len(pixels), dtype=float, device=device)
@@ -167,11 +158,9 @@ class _BlendedViews:
 
     def connect(self, graph: Any) -> None:
         """Let neighbours count for each other, by a symmetric sparse matrix."""
-        parts = (graph.indptr, int), (graph.indices, int), (graph.data, float)
-        self._graph = tuple(
-            upload(array.astype(np.float32 if kind is float else np.int32), kind, self.device) for array, kind in parts
-        )
-        scaling = self._worth.numpy()
+        ends, others = (upload(array.astype(np.int32), int, self.device) for array in (graph.indptr, graph.indices))
+        self._graph = ends, others, upload(graph.data.astype(np.float32), float, self.device)
+        scaling = self._worth.numpy().copy()  # on the CPU it is the same memory
         scaling[:, :3] += 2.0 * np.asarray(graph.sum(axis=1))[:, None]  # Gershgorin 1931
         self._scaling = upload(scaling, float, self.device)
 
