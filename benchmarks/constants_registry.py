@@ -304,6 +304,7 @@ MATERIALS = (
     Constant("beam_warp.materials.normals:LEAST_TOWARDS", JUDGED, "An own axis that faces as pixels see."),
     Constant(EVIDENCE + "LEAST_WEIGHT", BOTH, "Samples that must show a Gaussian for it to be seen."),
     Constant("beam_warp.materials.blended_color:SMOOTHNESS", ALL, "What differences between neighbours count."),
+    Constant("beam_warp.materials.blended_color:CONTRAST", ALL, "Difference of neighbours at which it counts half."),
     Constant("beam_warp.materials.blended_color:EDGE", ALL, "Difference of neighbours that is no edge."),
     Constant("beam_warp.materials.blended_color:PASSES", ALL, "Passes over the views for base colour."),
     Constant("beam_warp.materials.blended_color:NEIGHBORS", JUDGED, "Gaussians around one that it is compared with."),

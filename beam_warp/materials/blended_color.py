@@ -10,7 +10,7 @@ neighbours:
 
 with blending weights W, what a white Gaussian would send by diffusion D, and what views show of each less its
 highlights y. Weights are those of the solution that it begins with: Cauchy's for pixels, and for neighbours those of
-the total variation, which keeps edges.
+the total variation, which keeps edges, and less of what differs by far.
 
 What views show of each Gaussian has what images show beyond the fit already, at the resolution of the fit. So that no
 image is read here, and a sample a pixel is enough: both sides are drawn alike.
@@ -57,6 +57,10 @@ EDGE = 0.1
 """Difference of neighbours, over the subject's mean base colour, below which it counts by its square: what is as small
 is no edge."""
 
+CONTRAST = 2.0
+"""Difference of neighbours, over the subject's mean base colour, at which it counts half: what differs by as much is
+other paint, and must not bleed."""
+
 PASSES = 8
 """Passes over the views: by then base colour has settled to a hundredth of what it moves by."""
 
@@ -94,7 +98,8 @@ def _connections(
 ) -> Any:
     """Return how much neighbours count for each other, a symmetric sparse matrix ``(M, M)``.
 
-    That of the total variation where base colour is now: 1 / sqrt(d^2 + e^2), d being how far two differ.
+    That of the total variation where base colour is now, 1 / sqrt(d^2 + e^2), d being how far two differ, times
+    1 / (1 + d^2 / c^2).
     """
     rows = np.flatnonzero(known)
     count = min(NEIGHBORS, len(rows) - 1)
@@ -102,7 +107,7 @@ def _connections(
     own = np.repeat(rows, count)
     level = max(float(colors[rows].mean()), 1e-3)
     apart = np.square((colors[own] - colors[near]).astype(np.float64) / level).sum(axis=1)
-    weights = SMOOTHNESS * worth / level**2 / np.sqrt(apart + EDGE**2)
+    weights = SMOOTHNESS * worth / level**2 / np.sqrt(apart + EDGE**2) / (1.0 + apart / CONTRAST**2)
     pairs = coo_array((weights, (own, near)), shape=(len(known), len(known)))
     return (pairs + pairs.T).tocsr()
 

@@ -108,6 +108,7 @@ def dense(scene, colors, start):
         for j in near[i]:
             apart = (((start[i] - start[j]) / level) ** 2).sum()
             tie = blended_color.SMOOTHNESS * typical / level**2 / np.sqrt(apart + blended_color.EDGE**2)
+            tie /= 1.0 + apart / blended_color.CONTRAST**2
             graph[i, j] += tie
             graph[j, i] += tie
     smooth = np.diag(graph.sum(axis=1)) - graph
