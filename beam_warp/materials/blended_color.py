@@ -62,7 +62,7 @@ CONTRAST = 2.0
 other paint, and must not bleed."""
 
 PASSES = 8
-"""Passes over the views: by then base colour has settled to a hundredth of what it moves by."""
+"""Passes over the views: more of them change base colour of the captures by less than a tenth of a decibel."""
 
 BRIGHTEST = 2.0
 """Base colour that solving begins with, at most: above 1 only a light that is stated too dim would ask for it."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from beam_warp.capture.quality import WHOLE, photon_noise
 from beam_warp.capture.views import CapturedView
+from beam_warp.checks import require_count
 from beam_warp.device.arrays import resolve_device, upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
@@ -142,6 +143,7 @@ def view_evidence(
 
     Raises:
         InvalidArrayError: The cloud has no radiance, or images are not as many as cameras.
+        InvalidOptionError: ``samples`` is out of range.
 
     Source: the transpose of alpha blending, as in the gradients of Kerbl et al. 2023.
     """
@@ -160,7 +162,10 @@ def view_evidence(
     colors = wp.zeros((observed, count), dtype=wp.vec4, device=target)
     directions = wp.zeros((observed, count), dtype=wp.vec3, device=target)
     raster = options or RasterOptions()
-    side = samples_of_fit(cloud, cameras, raster) if samples == "auto" else samples
+    if samples == "auto":
+        side = samples_of_fit(cloud, cameras, raster)
+    else:
+        side = require_count("samples", samples, 1, 8)
     cut = _cut_to_subject(cloud, cameras, images)
     seen_by: list[Camera] = []
     for rasterizer, part, group in _groups(count, cut, side, raster, target):

@@ -80,7 +80,7 @@ def samples_of_fit(cloud: GaussianCloud, cameras: Sequence[Camera], options: Ras
 
 
 def reduction_factor(cloud: GaussianCloud, cameras: Sequence[Camera], *, near: float) -> int:
-    """Return by how much images may be reduced for baking, the same for all: 1 unless pixels are far finer than splats.
+    """Return by how much images may be reduced, the same for all: 1 unless pixels are far finer than splats.
 
     A splat's deviation is the second largest scale of its Gaussian, seen from the front.
 

@@ -10,7 +10,7 @@ from support.shapes import cloud_of, colored, disc_points, sphere_points, tiles,
 
 from beam_warp.capture.views import CapturedView
 from beam_warp.device.arrays import upload
-from beam_warp.errors import InvalidArrayError
+from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.metrics import block_means
 from beam_warp.kernels.materials.neighborhoods import (
@@ -314,6 +314,10 @@ class TestColors:
         assert off[side].max() < 2e-4
         assert off[1].max() > 0.02
         np.testing.assert_array_equal(off["auto"], off[side])
+
+    def test_samples_that_are_none_are_refused(self, ball):
+        with pytest.raises(InvalidOptionError, match=r"samples must be .*, got 0"):
+            view_evidence(ball, around(1), samples=0, device="cpu")
 
     def test_colours_are_those_that_each_camera_sees(self, ball, device, rng):
         """Harmonics of degree 3 are evaluated along the way from the camera: the other side shows other colours."""
