@@ -89,6 +89,7 @@ RESIDUES = "beam_warp.kernels.materials.residues:"
 SEEN_COLORS = "beam_warp.kernels.reconstruction.seen_colors:"
 DEFERRED = "beam_warp.render.options:DeferredOptions."
 SHADOWS = "beam_warp.kernels.render.shadow_maps:"
+SOURCES = "beam_warp.light.compact_sources:"
 VERTICES = "beam_warp.kernels.render.path_vertices:"
 
 RECONSTRUCTION = (
@@ -553,9 +554,9 @@ MATERIALS = (
 )
 
 RELIGHTING = (
-    Constant(DEFERRED + "environment_shadows", BOTH, "Directions that cast the environment's shadows.", more=2.0),
+    Constant(DEFERRED + "environment_shadows", BOTH, "Shadow maps of the environment.", more=2.0),
     Constant(DEFERRED + "bounces", BOTH, "How often light goes from surface to surface."),
-    Constant(DEFERRED + "environment_map_size", BOTH, "Side of their shadow maps [texel]."),
+    Constant(DEFERRED + "environment_map_size", BOTH, "Side of those of its regions [texel]."),
     Constant("beam_warp.render.arriving:CLUSTER_COUNT", BOTH, "Clusters that light bounces between."),
     Constant("beam_warp.render.arriving:REGION_TAPS", BOTH, "Taps that search and filter an environment's shadows."),
     Constant("beam_warp.render.shadow_maps:ROOM", JUDGED, "What a map shows, in radii of the subject."),
@@ -567,8 +568,11 @@ RELIGHTING = (
     Constant(
         "beam_warp.light.regions:WIDEST", JUDGED, "Largest half angle of a region's disc [rad].", most=math.pi / 2.1
     ),
-    Constant(DEFERRED + "light_map_size", BOTH, "Side of lamps' shadow maps [texel].", LAMPS),
-    Constant("beam_warp.render.arriving:LIGHT_TAPS", BOTH, "Taps that search and filter lamps' shadows.", LAMPS),
+    Constant(SOURCES + "LEAST_SHARE", JUDGED, "Least part of an environment's power of a small source.", most=1.0),
+    Constant(SOURCES + "WIDEST", JUDGED, "Largest half angle of a small source [rad]."),
+    Constant(SOURCES + "MOST_OF_IT", JUDGED, "Part of its power that a narrower disc must hold.", most=1.0),
+    Constant(DEFERRED + "light_map_size", BOTH, "Side of lamps' and small sources' shadow maps [texel]."),
+    Constant("beam_warp.render.arriving:LIGHT_TAPS", BOTH, "Taps that search and filter those shadows."),
     Constant("beam_warp.render.shadow_maps:WIDEST", JUDGED, "Half angle of a single view [degree].", LAMPS),
     Constant("beam_warp.render.shadow_maps:NEARBY", JUDGED, "Radii within which props cast shadows.", "there are none"),
 )

@@ -14,10 +14,12 @@ from beam_warp.kernels.light.product_sampling import EnvironmentBlocks
 from beam_warp.kernels.light.product_tree import ProductTree
 from beam_warp.kernels.light.shading import EnvironmentLight
 from beam_warp.kernels.trace.incident_light import LightMoments
+from beam_warp.light.compact_sources import split_sources
 from beam_warp.light.prefiltered import blurred_environment
 from beam_warp.light.regions import EnvironmentRegions
 from beam_warp.light.sampled import environment_blocks, environment_distribution, fitted, light_moments, product_tree
 from beam_warp.world.environment import EnvironmentMap
+from beam_warp.world.lights import DirectionalLight
 
 NO_LIGHT = EnvironmentMap.constant((0.0, 0.0, 0.0), height=4)
 """The environment of a shot that has none."""
@@ -30,8 +32,8 @@ class PreparedEnvironment:
     """An environment on a device. Each form of it is made when it is first asked for, once.
 
     `blurred` serves shading; `distribution`, `blocks` and `product_tree` serve sampling; `moments` and
-    `mean_irradiance` are the light with nothing in the way; `regions` serve shadow maps. Forms for sampling and moments
-    see the texels of `beam_warp.light.sampled.fitted`.
+    `mean_irradiance` are the light with nothing in the way; `regions` and `split` serve shadow maps. Forms for sampling
+    and moments see the texels of `beam_warp.light.sampled.fitted`.
 
     Attributes:
         environment: The light.
@@ -97,6 +99,16 @@ class PreparedEnvironment:
         if count not in self._regions:
             self._regions[count] = EnvironmentRegions.of(self.environment, count)
         return self._regions[count]
+
+    @cached_property
+    def split(self) -> tuple[PreparedEnvironment, tuple[DirectionalLight, ...]]:
+        """What is left without the small bright sources, and these; see `beam_warp.light.compact_sources`."""
+        if self._unscaled is not None:
+            source, factor = self._unscaled
+            rest, sources = source.split
+            return (rest.scaled(factor) if sources else self), tuple(light.scaled(factor) for light in sources)
+        rest, sources = split_sources(self.environment)
+        return (PreparedEnvironment(rest, self.device) if sources else self), sources
 
     def scaled(self, factor: float) -> PreparedEnvironment:
         """Return the same light times a factor. Its forms are scaled, not made again: directions stay."""

@@ -1,8 +1,9 @@
 """Light that reaches Gaussians in deferred shading: shadow maps of lights and of an environment's regions, and bounces.
 
-The environment is cut into regions (`beam_warp.light.regions`), each with a shadow map. A
-Gaussian gets the irradiance in closed form times the share that the regions' shadows leave, and what surfaces around it
-send (``kernels/render/cluster_bounces.py``). Both are blended into pixels like a material.
+Small bright sources of the environment become lights (`beam_warp.light.compact_sources`), shaded pixel by pixel. What
+is left is cut into regions (`beam_warp.light.regions`), each with a shadow map. A Gaussian gets the irradiance of that
+in closed form times the share that the regions' shadows leave, and what surfaces around it send
+(``kernels/render/cluster_bounces.py``). Both are blended into pixels like a material.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from beam_warp.raster.records import GaussianArrays
 from beam_warp.render.options import DeferredOptions
 from beam_warp.render.shadow_maps import ShadowCasters, ShadowDrawer, ShadowView, distant_view, light_views
 from beam_warp.world.environment import EnvironmentMap
-from beam_warp.world.lights import Light
+from beam_warp.world.lights import DirectionalLight, Light
 
 CLUSTER_COUNT = 1024
 """Clusters that light bounces between: a subject of 1.7 m has one every 5 cm."""
@@ -76,6 +77,7 @@ class ArrivingLight:
         self._region_drawer: ShadowDrawer | None = None
         self._light_drawer: ShadowDrawer | None = None
         self._shown: Any = None
+        self._sources: tuple[DirectionalLight, ...] = ()
         self._lamps: tuple[Light, ...] | None = None
         self._map_counts: list[int] = []
         self._stale = {"regions": True, "lights": True}
@@ -90,14 +92,22 @@ class ArrivingLight:
     def set_environment(
         self, environment: EnvironmentMap | None, degrees: float, casters: ShadowCasters, *, moved: bool
     ) -> None:
-        """Take an environment, turned about z; ``moved`` says that something else casts shadows than before."""
-        shown = self._environments.of(environment)
+        """Take an environment, turned about z; ``moved`` says that something else casts shadows than before.
+
+        Lights are to be set afterwards: some of the environment's sources join them.
+        """
+        shown, sources = self._environments.of(environment), ()
+        if self._options.environment_shadows:
+            shown, sources = shown.split
+        self._sources = tuple(source.turned(degrees) for source in sources)
         if (shown, degrees) == self._shown and not moved:
             return
         if self._shown is None or shown is not self._shown[0]:
             self._distant.light = shown.blurred
             self.generation += 1
-        count = 0 if shown.environment is NO_LIGHT else self._options.environment_shadows
+        count = 0
+        if self._options.environment_shadows and shown.environment is not NO_LIGHT:
+            count = max(self._options.environment_shadows - len(sources), 1)
         regions = shown.regions(count).turned(degrees) if count else None
         angle = np.radians(degrees)
         self._distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
@@ -124,7 +134,8 @@ class ArrivingLight:
         self._stale["regions"] = True
 
     def set_lights(self, lights: tuple[Light, ...], casters: ShadowCasters, *, moved: bool) -> None:
-        """Take lights; ``moved`` says that something else casts shadows than before."""
+        """Take lights beside the environment's; ``moved`` says that something else casts shadows than before."""
+        lights = (*lights, *self._sources)
         if lights == self._lamps and not moved:
             return
         views = [

@@ -1,13 +1,13 @@
 """The real-time renderer: deferred shading of Gaussians and meshes under an environment and lights, with shadows.
 
 A G-buffer of materials is drawn, and lit pixel by pixel: by the environment's split sum
-(`beam_warp.light.prefiltered`), by every light through what the path tracers scatter too
-(``kernels/light/scattering.py``), shadowed by maps that the same rasteriser draws (`beam_warp.render.shadow_maps`,
-where their bias is stated). Shadows of the environment and light between surfaces are found for every Gaussian
-(`beam_warp.render.arriving`).
+(`beam_warp.light.prefiltered`), by every light and small bright source of the environment through what the path tracers
+scatter too (``kernels/light/scattering.py``), shadowed by maps that the same rasteriser draws
+(`beam_warp.render.shadow_maps`, where their bias is stated). Shadows of the rest of the environment and light between
+surfaces are found for every Gaussian (`beam_warp.render.arriving`).
 
-Left out: reflections of surfaces in surfaces, light from meshes to Gaussians and back, the stretch of glossy lobes at
-grazing angles, scattering inside. docs/rendering.md has measurements.
+Left out: reflections of surfaces in surfaces, light from meshes to Gaussians and back, the stretch at grazing angles of
+lobes that see more than small sources, scattering inside. docs/rendering.md has measurements.
 """
 
 from __future__ import annotations

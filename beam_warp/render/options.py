@@ -16,11 +16,12 @@ class DeferredOptions:
     """How shots are shaded.
 
     Attributes:
-        environment_shadows: Directions that stand for the environment where shadows are cast; 0 takes ambient
-            occlusion instead.
+        environment_shadows: Shadow maps of the environment: of its small bright sources, which are shaded as lights
+            (`beam_warp.light.compact_sources`), and of regions of what is left, at least one. 0 takes ambient
+            occlusion instead, and the split sum for all of it.
         bounces: How often light goes from surface to surface of the Gaussians; 0 for none.
-        light_map_size: Side of every light's shadow maps [texel].
-        environment_map_size: Side of the environment's shadow maps [texel].
+        light_map_size: Side of every light's shadow maps, the environment's sources included [texel].
+        environment_map_size: Side of the shadow maps of the environment's regions [texel].
         samples: Side of the square of samples of a pixel: the image is their mean.
         layers: Names from `LAYERS`: what images come with besides colour and alpha.
 

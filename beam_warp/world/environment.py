@@ -195,12 +195,12 @@ class EnvironmentMap:
         return np.maximum(result, 0.0)  # a dark hemisphere is zero up to the rounding of the FFT
 
 
-def texel_directions(height: int, width: int) -> NDArray[np.float64]:
-    """Return the unit directions of the texel centres of a lat-long grid, ``(height, width, 3)``."""
-    theta = (np.arange(height) + 0.5) * (np.pi / height)
+def texel_directions(height: int, width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
+    """Return the unit directions of the texel centres of a lat-long grid, or of some of its rows, ``(R, width, 3)``."""
+    theta = (np.arange(height)[rows] + 0.5) * (np.pi / height)
     phi = np.pi - (np.arange(width) + 0.5) * (2.0 * np.pi / width)
     sine = np.sin(theta)[:, None]
-    up = np.broadcast_to(np.cos(theta)[:, None], (height, width))
+    up = np.broadcast_to(np.cos(theta)[:, None], (len(theta), width))
     return np.stack([sine * np.cos(phi), sine * np.sin(phi), up], axis=-1)
 
 

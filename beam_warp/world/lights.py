@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -59,6 +59,17 @@ class DirectionalLight:
         _set_direction(self)
         _set_power(self, "irradiance")
         require_number("angular_diameter", self.angular_diameter, 0.0, 90.0)
+
+    def scaled(self, factor: float) -> DirectionalLight:
+        """Return the light times a factor of at least 0."""
+        red, green, blue = self.irradiance
+        return replace(self, irradiance=(red * factor, green * factor, blue * factor))
+
+    def turned(self, degrees: float) -> DirectionalLight:
+        """Return the light turned about z, counter-clockwise from above."""
+        x, y, z = self.direction
+        cosine, sine = float(np.cos(np.radians(degrees))), float(np.sin(np.radians(degrees)))
+        return replace(self, direction=(cosine * x - sine * y, sine * x + cosine * y, z))
 
 
 @dataclass(frozen=True, kw_only=True)

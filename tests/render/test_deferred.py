@@ -43,6 +43,7 @@ FIREFLY = even_but(0.1, np.s_[3, 5], 5e4)
 SKY, OTHER_SKY = (
     EnvironmentMap((np.random.default_rng(seed).random((8, 16, 3)) ** 4).astype(np.float32)) for seed in (1, 2)
 )
+LOW_SUN = even_but(0.0, np.s_[82:84, 89:91], (400.0, 300.0, 200.0), height=180)  # at azimuth 90 degrees, 7 high
 SUN = DirectionalLight(direction=(0, 0, -1), irradiance=(1, 1, 1), angular_diameter=0.0)
 
 
@@ -154,6 +155,28 @@ def test_a_wide_light_in_a_glossy_plane(device, roughness, diameter, most):
         errors.append(abs(middle(render(shot, device))[0] - expected))
         values.append(expected)
     assert max(errors) < most * max(values)
+
+
+@pytest.mark.parametrize(("roughness", "most"), [(0.3, 0.08), (0.6, 0.02)])
+def test_a_low_sun_of_an_environment_in_a_glossy_plane(device, roughness, most):
+    """Sum over texels of L cos (rho (1 - E_spec) / pi + f_s), float64: a sun of 2 degrees, 7 above a plane that is seen
+    from 15 above it. The split sum has half of it or less; a lobe widened by a disc is not stretched as it grazes.
+    """
+    environment, color = LOW_SUN, np.array([0.9, 0.5, 0.2])
+    eye = 2.0 * np.array([0.0, -np.cos(np.radians(15.0)), np.sin(np.radians(15.0))])
+    shot = Shot(cloud=floor(color=color, roughness=roughness), camera=camera(eye, fov=1.0), environment=environment)
+    view, expected = eye / np.linalg.norm(eye), np.zeros(3)
+    directions, angles = environment.directions(), environment.solid_angles()
+    for row, column in np.argwhere(environment.radiance[..., 0] > 0.0):
+        way = directions[row, column]
+        diffuse = color * (1.0 - specular_albedo(view[2], roughness)) / np.pi
+        scattered = diffuse + brdf_twin(UP, view, way, roughness)
+        expected += environment.radiance[row, column] * way[2] * angles[row, column] * scattered
+    found = middle(render(shot, device, SMALL))
+    np.testing.assert_allclose(found, expected, rtol=most)
+    turned = replace(shot, environment=environment.rotated(-90.0), environment_rotation=90.0)
+    np.testing.assert_allclose(middle(render(turned, device, SMALL)), found, rtol=1e-4)
+    assert (middle(render(shot, device)) < 0.5 * expected).all()  # what the split sum alone makes of it
 
 
 def test_shadows_of_gaussians_on_gaussians(device):

@@ -147,7 +147,7 @@ class DeferredFlags:
     ] = None
     environment_shadows: Annotated[
         int | None,
-        arg(metavar="N", help="Deferred: directions from which the environment casts shadows; 0 for none."),
+        arg(metavar="N", help="Deferred: shadow maps of the environment, its small sources' among them; 0 for none."),
         SECOND_PAGE,
     ] = None
     shadow_resolution: Annotated[

@@ -1,0 +1,133 @@
+"""Suns and lamps of an environment, told apart from what is around them: as lights, they are shaded exactly.
+
+A split sum blurs what a lobe sees as if the surface were looked at from straight above. Under a source smaller than the
+lobe, that takes most of the light from highlights near a silhouette, and puts it elsewhere. A light of the same power
+and size needs no split sum, and has a shadow of its own.
+
+A source is what a disc has beyond the median of the ring around it: a sun leaves the sky that it stands in. What is
+taken is taken texel by texel, so that no light is lost.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beam_warp.image.color import LUMINANCE
+from beam_warp.world.environment import EnvironmentMap, texel_directions
+from beam_warp.world.lights import DirectionalLight
+
+MOST_SOURCES = 4
+"""Most sources that are told apart: each costs a shadow map and a light of every pixel."""
+
+LEAST_SHARE = 0.03
+"""Part of an environment's power from which on a source is worth that: half of what one of 16 regions has."""
+
+RADII = np.radians((8.0, 4.0, 2.0, 1.0))
+"""Discs in which a source is looked for, the widest first."""
+
+MOST_OF_IT = 0.9
+"""Part of a source's power that a narrower disc must hold to be taken instead: glare would make a sun larger."""
+
+WIDEST = np.radians(4.0)
+"""Largest half angle of a source: lobes of roughness 0.3 and more hardly show its shape."""
+
+CELL_ROWS = 90
+"""Rows of the cells among which the one of most power is looked at next, 2 degrees high."""
+
+CENTERINGS = 3
+"""Times that a disc is moved to the middle of its source."""
+
+
+class SplitEnvironment(NamedTuple):
+    """An environment in two parts that add up to it.
+
+    Attributes:
+        rest: What is left; the same object where nothing is taken.
+        sources: What was taken.
+    """
+
+    rest: EnvironmentMap
+    sources: tuple[DirectionalLight, ...]
+
+
+def split_sources(environment: EnvironmentMap) -> SplitEnvironment:
+    """Tell the small sources of an environment apart that have `LEAST_SHARE` of its power, at most `MOST_SOURCES`.
+
+    A source becomes the disc of even radiance whose directions spread as the source's do, the extent of its texels
+    included: maps of large texels have none.
+    """
+    rest, sources = environment, []
+    least = LEAST_SHARE * 4.0 * np.pi * float(environment.mean_radiance() @ LUMINANCE)
+    while len(sources) < MOST_SOURCES:
+        found = _find_source(rest, least)
+        if found is None:
+            break
+        sources.append(found.light)
+        radiance = rest.radiance.copy()
+        radiance[found.texels] = np.minimum(radiance[found.texels], found.around)
+        rest = EnvironmentMap(radiance)
+    return SplitEnvironment(rest, tuple(sources))
+
+
+class _Source(NamedTuple):
+    """A source, and where it is in the map.
+
+    Attributes:
+        light: The source.
+        texels: Rows and columns of its disc.
+        around: Radiance of what it stands in, ``(3,)``.
+    """
+
+    light: DirectionalLight
+    texels: tuple[NDArray[np.intp], NDArray[np.intp]]
+    around: NDArray[np.float32]
+
+
+def _find_source(environment: EnvironmentMap, least: float) -> _Source | None:
+    """Return the source about the cell of most power: the narrowest disc that holds `MOST_OF_IT`; None for none."""
+    middle = _strongest_direction(environment)
+    polar = np.arccos(np.clip(middle[2], -1.0, 1.0)) + np.array((-3.0, 3.0)) * RADII[0]  # a ring, and how far it moves
+    first, end = np.clip(np.round(polar / np.pi * environment.height).astype(int), 0, environment.height)
+    directions = texel_directions(environment.height, environment.width, slice(first, end))
+    radiance, angles = environment.radiance[first:end], environment.solid_angles()[first:end]
+    best, power = None, least
+    for radius in RADII:
+        for _ in range(CENTERINGS):
+            cosine = directions @ middle
+            inside = cosine > np.cos(radius)
+            ring = ~inside & (cosine > np.cos(2.0 * radius))
+            if not (inside.any() and ring.any()):
+                return best
+            around = np.median(radiance[ring], axis=0)
+            flux = np.maximum(radiance[inside] - around, 0.0) * angles[inside][:, None]
+            weights = flux @ LUMINANCE
+            moment = weights @ directions[inside]
+            length = float(np.linalg.norm(moment))
+            if not length > 0.0:
+                return best
+            middle = moment / length
+        cosines = directions[inside] @ middle
+        # of a disc of directions the mean cosine with its middle is (1 + cos half angle) / 2
+        spread = np.arccos(np.clip(2.0 * (weights @ cosines) / weights.sum() - 1.0, -1.0, 1.0))
+        half_angle = float(np.hypot(spread, 0.5 * np.pi / environment.height))
+        if weights.sum() >= power and half_angle <= min(WIDEST, 0.5 * radius):
+            light = DirectionalLight(
+                direction=tuple((-middle).tolist()),
+                irradiance=tuple((cosines @ flux).tolist()),
+                angular_diameter=2.0 * float(np.degrees(half_angle)),
+            )
+            rows, columns = np.nonzero(inside)
+            best = _Source(light, (rows + first, columns), around)
+            power = max(power, MOST_OF_IT * float(weights.sum()))
+    return best
+
+
+def _strongest_direction(environment: EnvironmentMap) -> NDArray[np.float64]:
+    """Return the direction of the cell of most power."""
+    rows = min(CELL_ROWS, environment.height)
+    cells = environment if rows == environment.height else environment.resized(rows, 2 * rows)
+    power = (cells.radiance @ LUMINANCE) * cells.solid_angles()
+    return cells.directions().reshape(-1, 3)[int(np.argmax(power))]
