@@ -86,6 +86,22 @@ class _Source(NamedTuple):
     around: NDArray[np.float32]
 
 
+class _Disc(NamedTuple):
+    """What a disc of a map has beyond the ring around it.
+
+    Attributes:
+        inside: The disc's texels, ``(R, W)``.
+        around: Radiance of the ring, the median, ``(3,)``.
+        flux: Radiance beyond it times solid angle [W/m^2], of the texels inside, ``(T, 3)``.
+        middle: Where this light comes from in the mean, a unit vector.
+    """
+
+    inside: NDArray[np.bool_]
+    around: NDArray[np.float32]
+    flux: NDArray[np.float64]
+    middle: NDArray[np.float64]
+
+
 def _find_source(environment: EnvironmentMap, least: float) -> _Source | None:
     """Return the source about the cell of most power: the narrowest disc that holds `MOST_OF_IT`; None for none."""
     middle = _strongest_direction(environment)
@@ -93,36 +109,60 @@ def _find_source(environment: EnvironmentMap, least: float) -> _Source | None:
     first, end = np.clip(np.round(polar / np.pi * environment.height).astype(int), 0, environment.height)
     directions = texel_directions(environment.height, environment.width, slice(first, end))
     radiance, angles = environment.radiance[first:end], environment.solid_angles()[first:end]
-    best, power = None, least
+    found, power = None, least
     for radius in RADII:
-        for _ in range(CENTERINGS):
-            cosine = directions @ middle
-            inside = cosine > np.cos(radius)
-            ring = ~inside & (cosine > np.cos(2.0 * radius))
-            if not (inside.any() and ring.any()):
-                return best
-            around = np.median(radiance[ring], axis=0)
-            flux = np.maximum(radiance[inside] - around, 0.0) * angles[inside][:, None]
-            weights = flux @ LUMINANCE
-            moment = weights @ directions[inside]
-            length = float(np.linalg.norm(moment))
-            if not length > 0.0:
-                return best
-            middle = moment / length
-        cosines = directions[inside] @ middle
+        disc = _centered_disc(directions, radiance, angles, middle, radius)
+        if disc is None:
+            break
+        middle = disc.middle
+        cosines, weights = directions[disc.inside] @ middle, disc.flux @ LUMINANCE
         # of a disc of directions the mean cosine with its middle is (1 + cos half angle) / 2
         spread = np.arccos(np.clip(2.0 * (weights @ cosines) / weights.sum() - 1.0, -1.0, 1.0))
         half_angle = float(np.hypot(spread, 0.5 * np.pi / environment.height))
         if weights.sum() >= power and half_angle <= min(WIDEST, 0.5 * radius):
             light = DirectionalLight(
                 direction=tuple((-middle).tolist()),
-                irradiance=tuple((cosines @ flux).tolist()),
+                irradiance=tuple((cosines @ disc.flux).tolist()),
                 angular_diameter=2.0 * float(np.degrees(half_angle)),
             )
-            rows, columns = np.nonzero(inside)
-            best = _Source(light, (rows + first, columns), around)
+            rows, columns = np.nonzero(disc.inside)
+            found = _Source(light, (rows + first, columns), disc.around)
             power = max(power, MOST_OF_IT * float(weights.sum()))
-    return best
+    return found
+
+
+def _centered_disc(
+    directions: NDArray[np.float64],
+    radiance: NDArray[np.float32],
+    angles: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    radius: float,
+) -> _Disc | None:
+    """Move a disc to the middle of what it has beyond its ring; None where that is nothing.
+
+    Args:
+        directions: Of the texels, ``(R, W, 3)``.
+        radiance: Of the same, ``(R, W, 3)``.
+        angles: Their solid angles [sr], ``(R, W)``.
+        middle: Where to begin.
+        radius: Of the disc; half of the ring's [rad].
+    """
+    disc = None
+    for _ in range(CENTERINGS):
+        cosine = directions @ middle
+        inside = cosine > np.cos(radius)
+        ring = ~inside & (cosine > np.cos(2.0 * radius))
+        if not (inside.any() and ring.any()):
+            return None
+        around = np.median(radiance[ring], axis=0)
+        flux = np.maximum(radiance[inside] - around, 0.0) * angles[inside][:, None]
+        moment = (flux @ LUMINANCE) @ directions[inside]
+        length = float(np.linalg.norm(moment))
+        if not length > 0.0:
+            return None
+        middle = moment / length
+        disc = _Disc(inside, around, flux, middle)
+    return disc
 
 
 def _strongest_direction(environment: EnvironmentMap) -> NDArray[np.float64]:

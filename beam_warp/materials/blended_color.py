@@ -27,6 +27,7 @@ from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from beam_warp.device.arrays import upload
+from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.common.row_sums import launch_add_rows
 from beam_warp.kernels.materials.blended_color import (
     LitView,
@@ -72,7 +73,12 @@ COLUMNS = 4
 
 
 def solve_blended(
-    cloud: GaussianCloud, views: ViewEvidence, measured: LitPoints, separate: NDArray[np.floating[Any]]
+    cloud: GaussianCloud,
+    views: ViewEvidence,
+    measured: LitPoints,
+    separate: NDArray[np.floating[Any]],
+    *,
+    progress: CountProgress | None = None,
 ) -> NDArray[np.float32]:
     """Return base colour by what all pixels say together, unbounded, ``(M, 3)``.
 
@@ -81,13 +87,14 @@ def solve_blended(
         views: What views with images show of all of them.
         measured: Those whose light is known, with that light.
         separate: Base colour of each of these by itself, ``(M, 3)``; NaN for what has no evidence, which is returned.
+        progress: Called with (views drawn, views to draw in all passes) after each.
     """
     known = np.asarray(np.isfinite(separate).all(axis=1))
     if known.sum() < 2:
         return np.asarray(separate, np.float32)
     start = np.clip(np.where(known[:, None], separate, 0.0), 0.0, BRIGHTEST).astype(np.float32)
     values = upload(np.pad(start, ((0, 0), (0, COLUMNS - 3))), float, measured.surface.normals.device)
-    blends = _BlendedViews(cloud, views, measured, values, known)
+    blends = _BlendedViews(cloud, views, measured, values, known, progress)
     blends.connect(_connections(cloud.positions[measured.rows], start, known, blends.typical_worth()))
     solve_bounded(blends, values, bounds=(-np.inf, np.inf), passes=PASSES, tolerance=0.0)
     return np.where(known[:, None], values.numpy()[:, :3], np.nan).astype(np.float32)
@@ -116,10 +123,17 @@ class _BlendedViews:
     """The problem as `beam_warp.materials.bounded_solve` takes it; a view is drawn at a time."""
 
     def __init__(
-        self, cloud: GaussianCloud, views: ViewEvidence, measured: LitPoints, start: wp.array, known: NDArray[np.bool_]
+        self,
+        cloud: GaussianCloud,
+        views: ViewEvidence,
+        measured: LitPoints,
+        start: wp.array,
+        known: NDArray[np.bool_],
+        progress: CountProgress | None,
     ) -> None:
         """Draw every view once, and find what its pixels count and say of the start, ``(M, COLUMNS)``."""
         self.device = device = start.device
+        self._progress, self._drawn, self._to_draw = progress, 0, (1 + PASSES) * len(views.cameras)
         count, points = len(cloud), len(measured.rows)
         self._values = wp.zeros((count, COLUMNS), dtype=float, device=device)
         self._rows = wp.empty((count, COLUMNS), dtype=float, device=device)
@@ -153,6 +167,7 @@ class _BlendedViews:
             launch_add_said(points, lit, self._rows, -1.0, self._gradient, device)
             launch_add_worth(points, lit, self._rows, self._worth, device)
             self._views.append((rasterizer, weights))
+            self._report()
         self._graph: tuple[wp.array, ...] = ()
         self._scaling = self._worth
 
@@ -188,7 +203,14 @@ class _BlendedViews:
             launch_weigh_explained(len(pixels), weights, pixels, self.device)
             rasterizer.back_project(pixels, self._rows)
             launch_add_said(len(values), self._lit, self._rows, 1.0, out, self.device)
+            self._report()
         self._add_differences(values, out)
+
+    def _report(self) -> None:
+        """Count another view that is drawn."""
+        self._drawn += 1
+        if self._progress is not None:
+            self._progress(self._drawn, self._to_draw)
 
     def _add_differences(self, values: wp.array, out: wp.array) -> None:
         launch_add_differences(len(values), values, *self._graph, out, self.device)

@@ -146,6 +146,18 @@ def measure_materials(
     device = scene.device
     chosen = np.arange(len(cloud)) if rows is None else np.asarray(rows)
     count = len(chosen)
+    blends = views is not None and bool(views.cameras) and options.blended and rows is None
+
+    def part(number: int) -> CountProgress:
+        """Tell of occlusion, light and blends, which are about as much work each."""
+        parts = 3 if blends else 2
+
+        def report(done: int, total: int) -> None:
+            if progress is not None:
+                progress(count * (number * total + done) // max(parts * total, 1), count)
+
+        return report
+
     shown = chosen[points.seen[chosen]]
     at = upload(shown.astype(np.int32), int, device)
     occlusion = ambient_occlusion(
@@ -157,26 +169,21 @@ def measure_materials(
         options=points.tracing,
         sampler=options.sampler,
         seed=options.seed,
-        # Occlusion and light are about as much work, so each is half of the way.
-        progress=None if progress is None else lambda done, _: progress(done // 2, count),
+        progress=part(0),
     )
     visibility = occlusion.visibility.numpy()
     # What is buried is filled from neighbours anyway: its light is not traced.
     lit = shown[visibility > BURIED_VISIBILITY]
-
-    def report(done: int, total: int) -> None:
-        if progress is not None:
-            progress(count - (total - done) // 2, count)
-
     measured = lit_points(cloud, points, roughness, light, lit, views)
     bounced = mean_radiance(cloud, views) if options.bounce else None
-    for _ in light_batches(scene, points, light, measured, options, bounced, frame, report):
+    for _ in light_batches(scene, points, light, measured, options, bounced, frame, part(1)):
         pass
     fit = zero_struct(ColorFit, len(lit), device)
     launch_fit_color(measured.views, measured.light, measured.surface, options.robust, fit, device)
     numerator, denominator, observed = (fit.numerator.numpy(), fit.denominator.numpy(), fit.observed.numpy())
-    if views is not None and views.cameras and options.blended and rows is None:
-        numerator, observed = _blended_sums(cloud, views, measured, numerator, denominator, observed)
+    if views is not None and blends:
+        sums = numerator, denominator, observed
+        numerator, observed = _blended_sums(cloud, views, measured, *sums, progress=part(2))
 
     def by_row(values: NDArray[Any], at_rows: NDArray[np.integer[Any]], otherwise: float = 0.0) -> NDArray[np.float32]:
         """Spread what was measured over all rows that were asked for."""
@@ -224,6 +231,8 @@ def _blended_sums(
     numerator: NDArray[np.float32],
     denominator: NDArray[np.float32],
     observed: NDArray[np.float32],
+    *,
+    progress: CountProgress,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return sums whose least-squares solution is that of all pixels together; what views leave of it stays as it was.
 
@@ -234,6 +243,7 @@ def _blended_sums(
         numerator: Of `ColorEvidence`, of these; so are the others.
         denominator: Likewise.
         observed: Likewise.
+        progress: See `solve_blended`.
 
     Returns:
         The numerator, and what was observed.
@@ -241,7 +251,7 @@ def _blended_sums(
     weight = denominator.astype(np.float64)
     told = (weight > 0.0).all(axis=1, keepdims=True)
     separate = np.divide(numerator, weight, out=np.full_like(weight, np.nan), where=told & np.ones(3, bool))
-    joint = np.where(told, solve_blended(cloud, views, measured, separate), 0.0)
+    joint = np.where(told, solve_blended(cloud, views, measured, separate, progress=progress), 0.0)
     moved = weight * (joint**2 - np.where(told, separate, 0.0) ** 2)
     return np.where(told, weight * joint, numerator), observed + moved
 

@@ -41,7 +41,7 @@ class Scene:
         colors[:, self.rows] = self.light * self.share[..., None] * base_color + self.specular
         return colors
 
-    def solve(self, colors, separate, weights=1.0):
+    def solve(self, colors, separate, weights=1.0, progress=None):
         """Run the solver."""
         count, views, device = len(self.cloud), len(self.cameras), self.device
         weight = np.broadcast_to(np.float32(weights), (views, count))
@@ -69,7 +69,7 @@ class Scene:
             cameras=tuple(self.cameras),
             raster=RASTER,
         )
-        return solve_blended(self.cloud, views_shown, measured, separate)
+        return solve_blended(self.cloud, views_shown, measured, separate, progress=progress)
 
 
 def cameras_around(count, distance, side):
@@ -172,6 +172,14 @@ def test_what_has_no_evidence_stays_unknown_and_changes_nothing(ball, device, rn
     np.testing.assert_allclose(found[np.isfinite(separate)], 0.5, atol=1e-3)
     separate[1:] = np.nan
     np.testing.assert_array_equal(scene.solve(scene.shown(0.5), separate), separate.astype(np.float32))
+
+
+def test_progress_counts_the_views_of_all_passes(ball, device, rng):
+    scene = Scene(*ball, cameras_around(4, 6.0, 32), device, rng)
+    told, noisy = [], rng.uniform(0.3, 0.7, (1500, 3))
+    scene.solve(scene.shown(noisy), noisy, progress=lambda *at: told.append(at))
+    total = (1 + blended_color.PASSES) * 4
+    assert told == [(k + 1, total) for k in range(total)]
 
 
 def test_views_that_see_nothing_say_nothing(ball, device, rng):
