@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from beam_warp.image.color import LUMINANCE
 from beam_warp.world.environment import EnvironmentMap, texel_directions
-from beam_warp.world.lights import DirectionalLight
+from beam_warp.world.lights import MOST_POWER, DirectionalLight
 
 MOST_SOURCES = 4
 """Most sources that are told apart: each costs a shadow map and a light of every pixel."""
@@ -57,7 +57,7 @@ def split_sources(environment: EnvironmentMap) -> SplitEnvironment:
     """Tell the small sources of an environment apart that have `LEAST_SHARE` of its power, at most `MOST_SOURCES`.
 
     A source becomes the disc of even radiance whose directions spread as the source's do, the extent of its texels
-    included: maps of large texels have none.
+    included: maps of large texels have none. What no light can state, for its power, stays in the map.
     """
     rest, sources = environment, []
     least = LEAST_SHARE * 4.0 * np.pi * float(environment.mean_radiance() @ LUMINANCE)
@@ -119,10 +119,12 @@ def _find_source(environment: EnvironmentMap, least: float) -> _Source | None:
         # of a disc of directions the mean cosine with its middle is (1 + cos half angle) / 2
         spread = np.arccos(np.clip(2.0 * (weights @ cosines) / weights.sum() - 1.0, -1.0, 1.0))
         half_angle = float(np.hypot(spread, 0.5 * np.pi / environment.height))
-        if weights.sum() >= power and half_angle <= min(WIDEST, 0.5 * radius):
+        irradiance = cosines @ disc.flux
+        is_light = half_angle <= min(WIDEST, 0.5 * radius) and irradiance.max() <= MOST_POWER
+        if is_light and weights.sum() >= power:
             light = DirectionalLight(
                 direction=tuple((-middle).tolist()),
-                irradiance=tuple((cosines @ disc.flux).tolist()),
+                irradiance=tuple(irradiance.tolist()),
                 angular_diameter=2.0 * float(np.degrees(half_angle)),
             )
             rows, columns = np.nonzero(disc.inside)

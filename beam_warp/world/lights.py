@@ -27,6 +27,9 @@ from numpy.typing import NDArray
 from beam_warp.checks import require_array, require_finite, require_number, require_path, require_range
 from beam_warp.errors import AssetFormatError, BeamError, InvalidArrayError, InvalidOptionError, MissingFileError
 
+MOST_POWER = 1e12
+"""Largest number that states a light's power, of any unit."""
+
 SUN_DIAMETER = 0.53
 """Angular diameter of the sun [degree]."""
 
@@ -243,4 +246,4 @@ def _set_direction(light: Any) -> None:
 
 def _set_power(light: Any, name: str) -> None:
     """Check a power: finite, not negative."""
-    require_range(name, _set_vector(light, name), 0.0, 1e12, "Light is not negative.")
+    require_range(name, _set_vector(light, name), 0.0, MOST_POWER, "Light is not negative.")

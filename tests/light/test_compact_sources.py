@@ -75,8 +75,9 @@ def test_several_sources(rng):
         sky_with((toward(30.0, 40.0), 12.0, (50.0, 50.0, 50.0))),  # a soft box
         sky_with((toward(30.0, 40.0), 1.0, (30.0, 30.0, 30.0))),  # a lamp of 2 % of the power
         sky_with((toward(30.0, 40.0), 1.0, (9e4, 9e4, 9e4)), height=16),  # a texel is 11 degrees wide
+        sky_with((toward(30.0, 40.0), 1.0, (1e30, 1e30, 1e30))),  # more than a light can state
     ],
-    ids=["black", "even", "soft box", "faint", "coarse"],
+    ids=["black", "even", "soft box", "faint", "coarse", "beyond lights"],
 )
 def test_nothing_is_taken_that_is_not_small_and_strong(environment):
     split = split_sources(environment)
