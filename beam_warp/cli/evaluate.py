@@ -55,7 +55,10 @@ class Evaluate:
         arg(metavar="NAME ...", help="How relit images are made: deferred, path; none leaves them out."),
     ] = ("deferred",)
     scaled_relighting: Annotated[bool, arg(help="Also relight with base colour times its best scale.")] = False
-    samples: Annotated[int, arg(metavar="N", help="A pixel is the mean of N x N samples.")] = 2
+    samples: Annotated[
+        int | None,
+        arg(metavar="N", help="A pixel is the mean of N x N samples; by default as many as fits took, at least 2."),
+    ] = None
     capture_frames: Annotated[
         tuple[int, ...], arg(metavar="N ...", help="The capture's number of every frame; else as the asset states.")
     ] = ()

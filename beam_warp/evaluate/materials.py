@@ -27,6 +27,7 @@ from beam_warp.evaluate.steadiness import TemporalScores, gaussian_deviation, su
 from beam_warp.evaluate.views import ScoredView, ViewScorer
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import samples_of_fit
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -50,7 +51,8 @@ class EvaluateOptions:
             0, 1, 2, ….
         split: Which records of the capture.
         raster: How splats are drawn; None draws them as the asset's metadata states.
-        samples: Side of the square of samples of a pixel.
+        samples: Side of the square of samples of a pixel; None takes as many as the Gaussians need to look as they did
+            when they were fitted (`beam_warp.raster.resolution.samples_of_fit`), at least `SAMPLES`.
         relighters: Names in `beam_warp.evaluate.relighters.RELIGHTERS`.
         scaled_relighting: Also relight with base colour scaled, as is the custom where the capture's light is unknown.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
@@ -62,14 +64,15 @@ class EvaluateOptions:
     frames: tuple[int, ...] | None = None
     split: str = "test"
     raster: RasterOptions | None = None
-    samples: int = SAMPLES
+    samples: int | None = None
     relighters: tuple[str, ...] = ("deferred",)
     scaled_relighting: bool = False
     device: str | None = None
 
     def __post_init__(self) -> None:
         """Check names and samples."""
-        require_count("samples", self.samples, 1, 64)
+        if self.samples is not None:
+            require_count("samples", self.samples, 1, 64)
         for name in self.relighters:
             require_choice("relight", name, tuple(RELIGHTERS))
 
@@ -113,14 +116,18 @@ def score_materials(
     asset = ComparedAsset(sequence, capture, matched, chosen.split)
     drawn = chosen.raster or RasterOptions.from_metadata(sequence.metadata)
     made = {name: RELIGHTERS[name] for name in chosen.relighters} if relighters is None else relighters
+    shown = scored_frames(capture, matched, split=chosen.split)
+    samples = chosen.samples
+    if samples is None:
+        cameras = [record.camera for record in asset.records(shown[0])]
+        samples = max(samples_of_fit(asset.cloud(shown[0]), cameras, drawn), SAMPLES)
     scorer = ViewScorer(
         raster=drawn,
-        samples=chosen.samples,
-        renderers={name: make(drawn, chosen.samples, chosen.device) for name, make in made.items()},
+        samples=samples,
+        renderers={name: make(drawn, samples, chosen.device) for name, make in made.items()},
         metrics=metrics or PerceptualMetrics.installed(),
         device=chosen.device,
     )
-    shown = scored_frames(capture, matched, split=chosen.split)
     lights = asset.lights(shown) if scorer.renderers else {}
     _require_overlap(asset, scorer, shown[0])
     views, color_sums = _score_views(asset, scorer, shown, lights, observe, progress)

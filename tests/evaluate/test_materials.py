@@ -20,6 +20,7 @@ from beam_warp.evaluate.materials import EvaluateOptions, score_materials
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.relighters import RELIGHTERS
 from beam_warp.image.files import read_image, write_exr
+from beam_warp.raster import resolution
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
@@ -120,6 +121,19 @@ class TestAgainstItself:
         assert found.mean("depth_median_mm") == 0.0
         assert found.mean("overlap") == pytest.approx(1.0)
         assert found.scale_deviation == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+
+    @pytest.mark.parametrize(("spacing", "side"), [(2.0, 2), (0.8, 3), (0.1, 4)])
+    def test_samples_are_those_of_the_fit(self, asset, relit_capture, monkeypatch, spacing, side):
+        """Two on the distance of neighbours [pixel], 2 x 2 at least and 4 x 4 at most; what is stated counts, and
+        splats that are not antialiased keep the least."""
+        cameras = [record.camera for record in relit_capture.select(split="test", frames=[0])]
+        middle = np.median(next(iter(asset)).positions, axis=0)
+        pixel = np.median([(middle - camera.position) @ camera.forward / camera.focal_x for camera in cameras])
+        monkeypatch.setattr(resolution, "disc_spacing", lambda cloud: spacing * pixel)
+        fitted = {"raster": RasterOptions(antialiased=True, low_pass=0.1)}
+        for options, expected in ((fitted, side), ({**fitted, "samples": 1}, 1), ({"raster": RasterOptions()}, 2)):
+            found = score(asset, relit_capture, "cpu", **options)
+            assert found.conditions["samples_per_pixel"] == expected**2
 
     def test_a_factor_is_found_and_undone(self, asset, mirror, device):
         """Base colour times k needs 1/k: exactly, but for float32 of colours (6e-8) in the sums."""
