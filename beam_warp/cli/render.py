@@ -35,7 +35,7 @@ DEFAULT_SAMPLES = 2
 """Side of the square of samples of a pixel where ``--samples`` is not given.
 
 Images of a capture, and truth, are averages over a pixel. One sample in its middle costs an asset up to 7 dB of base
-colour against them; more than 2 x 2 samples gain little (docs/evaluation.md).
+colour against them; 2 x 2 have most of that, and fits take up to 4 x 4 (docs/evaluation.md).
 """
 
 

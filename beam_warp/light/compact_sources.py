@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beam_warp.image.color import LUMINANCE
+from beam_warp.light.regions import disc_half_angle
 from beam_warp.world.environment import EnvironmentMap, texel_directions
 from beam_warp.world.lights import MOST_POWER, DirectionalLight
 
@@ -116,8 +117,7 @@ def _find_source(environment: EnvironmentMap, least: float) -> _Source | None:
             break
         middle = disc.middle
         cosines, weights = directions[disc.inside] @ middle, disc.flux @ LUMINANCE
-        # of a disc of directions the mean cosine with its middle is (1 + cos half angle) / 2
-        spread = np.arccos(np.clip(2.0 * (weights @ cosines) / weights.sum() - 1.0, -1.0, 1.0))
+        spread = disc_half_angle(float(weights @ cosines) / float(weights.sum()))
         half_angle = float(np.hypot(spread, 0.5 * np.pi / environment.height))
         irradiance = cosines @ disc.flux
         is_light = half_angle <= min(WIDEST, 0.5 * radius) and irradiance.max() <= MOST_POWER

@@ -85,6 +85,14 @@ class EnvironmentRegions:
         return EnvironmentRegions(self.directions @ turn.T, self.half_angles, moments)
 
 
+def disc_half_angle(mean_cosine: float) -> float:
+    """Return the half angle [rad] of the disc of even radiance whose directions have a mean cosine with its middle.
+
+    That of a disc is (1 + cos half angle) / 2.
+    """
+    return float(np.arccos(np.clip(2.0 * mean_cosine - 1.0, -1.0, 1.0)))
+
+
 def _cut(power: NDArray[np.float64], directions: NDArray[np.float64], count: int) -> list[Box]:
     """Cut a map into boxes; the cut that takes most of the blur away is made first."""
     share = (power / power.sum())[..., None]
@@ -145,9 +153,8 @@ def _summed(
     mean = (weight[..., None] * directions).sum(axis=(0, 1))
     length = float(np.linalg.norm(mean))
     direction = mean / length if length > 1e-9 * max(weight.sum(), 1e-300) else np.array([0.0, 0.0, 1.0])
-    # of a disc of directions the mean cosine with its middle is (1 + cos half angle) / 2
     cosine = float((weight * (directions @ direction)).sum() / weight.sum()) if weight.size else 1.0
-    half_angle = float(np.arccos(np.clip(2.0 * cosine - 1.0, np.cos(WIDEST), 1.0)))
+    half_angle = min(disc_half_angle(cosine), WIDEST)
     sums = np.einsum("rcx,rck->kx", directions, flux)
     lengths = np.linalg.norm(sums, axis=1)
     spread = np.maximum(1.0 - lengths / np.maximum(flux.sum(axis=(0, 1)), 1e-300), 0.0)

@@ -240,9 +240,8 @@ class _Meter:
     def _light(self, light: Trial) -> None:
         """Take the lights of a draw, without shadows: their maps cost more than all the rest."""
         environment, lamps = self._trials.lights(light, self._cloud)
-        self._arriving.set_environment(environment, light.turn, self._casters, moved=False)
         lamps = tuple(replace(lamp, casts_shadows=False) for lamp in lamps)
-        self._arriving.set_lights(lamps, self._casters, moved=False)
+        self._arriving.set(environment, light.turn, lamps, self._casters, moved=False)
 
     def _carry_back(self, seen: SeenView, edges: wp.array) -> None:
         """Add the sums of a view."""

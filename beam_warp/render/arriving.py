@@ -8,6 +8,7 @@ in closed form times the share that the regions' shadows leave, and what surface
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -89,25 +90,33 @@ class ArrivingLight:
             items, _ = morton_order(positions, positions, everybody)
             wp.copy(self._clusters.order, items, count=self._count)
 
-    def set_environment(
+    def set(
+        self,
+        environment: EnvironmentMap | None,
+        degrees: float,
+        lights: Iterable[Light],
+        casters: ShadowCasters,
+        *,
+        moved: bool,
+    ) -> None:
+        """Take an environment, turned about z, and lights; ``moved`` says that something else casts shadows now."""
+        self._set_environment(environment, degrees, casters, moved=moved)
+        self._set_lights((*lights, *self._sources), casters, moved=moved)
+
+    def _set_environment(
         self, environment: EnvironmentMap | None, degrees: float, casters: ShadowCasters, *, moved: bool
     ) -> None:
-        """Take an environment, turned about z; ``moved`` says that something else casts shadows than before.
-
-        Lights are to be set afterwards: some of the environment's sources join them.
-        """
-        shown, sources = self._environments.of(environment), ()
-        if self._options.environment_shadows:
+        """Take an environment, turned about z, and tell its small bright sources apart."""
+        shown, sources, count = self._environments.of(environment), (), 0
+        if self._options.environment_shadows and shown.environment is not NO_LIGHT:
             shown, sources = shown.split
+            count = max(self._options.environment_shadows - len(sources), 1)
         self._sources = tuple(source.turned(degrees) for source in sources)
         if (shown, degrees) == self._shown and not moved:
             return
         if self._shown is None or shown is not self._shown[0]:
             self._distant.light = shown.blurred
             self.generation += 1
-        count = 0
-        if self._options.environment_shadows and shown.environment is not NO_LIGHT:
-            count = max(self._options.environment_shadows - len(sources), 1)
         regions = shown.regions(count).turned(degrees) if count else None
         angle = np.radians(degrees)
         self._distant.turn.assign(np.array([[np.cos(angle), np.sin(angle)]], np.float32))
@@ -133,9 +142,8 @@ class ArrivingLight:
         self._regions.moments = self._moments
         self._stale["regions"] = True
 
-    def set_lights(self, lights: tuple[Light, ...], casters: ShadowCasters, *, moved: bool) -> None:
-        """Take lights beside the environment's; ``moved`` says that something else casts shadows than before."""
-        lights = (*lights, *self._sources)
+    def _set_lights(self, lights: tuple[Light, ...], casters: ShadowCasters, *, moved: bool) -> None:
+        """Take lights, the environment's sources among them."""
         if lights == self._lamps and not moved:
             return
         views = [

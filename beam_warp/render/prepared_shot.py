@@ -120,8 +120,7 @@ class DeferredFrame:
         if moved:
             self._casters = ShadowCasters.of(shot.cloud, None if shot.mesh is None else shot.mesh.surface.vertices)
         self._set_cloud(shot.cloud)
-        self._light.set_environment(shot.environment, shot.environment_rotation, self._casters, moved=moved)
-        self._light.set_lights(tuple(shot.lights), self._casters, moved=moved)
+        self._light.set(shot.environment, shot.environment_rotation, shot.lights, self._casters, moved=moved)
 
     def _set_camera(self, camera: Camera) -> None:
         """Move the camera."""
