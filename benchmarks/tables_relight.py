@@ -13,6 +13,7 @@ from tables import Row, Rows, cell, figure, table
 SPEED = "relight_speed_h200.json"
 ACCURACY = "relight_accuracy_h200.json"
 ENERGY = "relight_energy_h200.json"
+LOBE = "specular_lobe_cpu.json"
 EVALUATION = "materials_evaluation_h200.json"
 
 USUAL = "N = 16"
@@ -46,6 +47,21 @@ def deferred(result: Row) -> Rows:
         moved = moving["cases"][name]
         times = (row["whole"], row["still_maps"], row["moving"], moved["refit"], moved["fast"])
         rows.append((name, *(rate(each) for each in times)))
+    return rows
+
+
+@table("specular_lobe", LOBE)
+def specular_lobe(result: Row) -> Rows:
+    """What four round lobes leave of the specular one, and what one leaves."""
+    cosines = sorted({row["cosine"] for row in result["left"]})
+    rows: list[Sequence[Any]] = [("roughness", *(f"cosine {cosine:.2f}" for cosine in cosines))]
+    for roughness in sorted({row["roughness"] for row in result["left"]}):
+        found = {row["cosine"]: row for row in result["left"] if row["roughness"] == roughness}
+        cells = (
+            f"{percent(row['four'])} of {percent(row['one'])}; {row['four_mean']:.3f} of {row['one_mean']:.3f}"
+            for row in (found[cosine] for cosine in cosines)
+        )
+        rows.append((f"{roughness:.1f}", *cells))
     return rows
 
 

@@ -1,8 +1,8 @@
 """Suns and lamps of an environment, told apart from what is around them: as lights, they are shaded exactly.
 
-A split sum blurs what a lobe sees as if the surface were looked at from straight above. Under a source smaller than the
-lobe, that takes most of the light from highlights near a silhouette, and puts it elsewhere. A light of the same power
-and size needs no split sum, and has a shadow of its own.
+What a lobe sees of an environment is looked up in maps that are blurred beforehand, by lobes that are nearly its own.
+Under a source smaller than the lobe, what they are off by shows most. A light of the same power and size needs no such
+maps, and has a shadow of its own.
 
 A source is what a disc has beyond the median of the ring around it: a sun leaves the sky that it stands in. What is
 taken is taken texel by texel, so that no light is lost.

@@ -19,6 +19,7 @@ from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB, srgb_to_linear
 from beam_warp.jobs.listeners import CountProgress
 from beam_warp.kernels.common.sampling import SampleSet
+from beam_warp.kernels.light.lights import Lights
 from beam_warp.kernels.light.product_sampling import launch_accumulate_block_weights
 from beam_warp.kernels.materials.residues import (
     ALBEDO_SCALING,
@@ -26,6 +27,7 @@ from beam_warp.kernels.materials.residues import (
     GatheredLight,
     LightRays,
     Observations,
+    ReflectedLight,
     ShadedPoints,
     launch_gather_light,
     launch_sample_radiance,
@@ -40,6 +42,7 @@ from beam_warp.kernels.trace.incident_light import (
 )
 from beam_warp.kernels.trace.surface_rays import RayBatch
 from beam_warp.light.prepared import PreparedEnvironment
+from beam_warp.light.uploaded import upload_lights
 from beam_warp.materials.evidence import ViewEvidence
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.materials.pilot import rays_needed
@@ -226,6 +229,14 @@ def lit_points(
     return LitPoints(arriving, surface, observed, np.asarray(rows, np.int64), rays, bounce_rays)
 
 
+def reflected_light(light: PreparedEnvironment) -> ReflectedLight:
+    """Return what specular lobes see of a light: small bright sources as such, and the rest blurred."""
+    rest, sources = light.split
+    reflected = ReflectedLight()
+    reflected.sources, reflected.rest = upload_lights(sources, light.device), rest.blurred
+    return reflected
+
+
 def light_batches(
     scene: Scene,
     points: SurfacePoints,
@@ -254,20 +265,23 @@ def light_batches(
     device = scene.device
     if not len(measured.rows):
         return
+    reflected = reflected_light(light)
     ways = LightPaths.of(scene, points, light, measured, options, frame)
-    measured.rays[:], pilot = ways.counted(measured.light)
+    measured.rays[:], pilot = ways.counted(reflected.sources, measured.light)
     if hit_radiance is not None:
         measured.bounce_rays[:] = ways.bounced(upload(hit_radiance, wp.vec3, device), measured.light)
     done = 0
     for count in np.unique(measured.rays):
         for batch in ways.batches(int(count), np.flatnonzero(measured.rays == count)):
             found = ways.traced(batch, pilot)
-            launch_gather_light(len(batch.rows), batch, found, int(options.ratio), measured.light, device)
+            launch_gather_light(
+                len(batch.rows), batch, found, int(options.ratio), reflected.sources, measured.light, device
+            )
             launch_view_residues(
                 batch,
                 found,
                 measured.light,
-                light.blurred,
+                reflected,
                 measured.surface,
                 DIFFUSE_WEIGHTS[options.diffuse_weight],
                 measured.views,
@@ -351,7 +365,7 @@ class LightPaths:
             launch_recall_visibility(items, parts[0], pilot.samples, batch, *pilot[1:], found.visibility, device)
         return found
 
-    def counted(self, out_light: GatheredLight) -> tuple[NDArray[np.int32], Pilot | None]:
+    def counted(self, sources: Lights, out_light: GatheredLight) -> tuple[NDArray[np.int32], Pilot | None]:
         """Return how many rays each point needs, and what its first ones met; ``out_light`` is used for their error."""
         (first, most), device, count = self.options.light_rays, self.scene.device, len(self.positions)
         if first == most:
@@ -359,7 +373,7 @@ class LightPaths:
         rows, seen = [], []
         for batch in self.batches(first, np.arange(count)):
             found = self.traced(batch)
-            launch_gather_light(len(batch.rows), batch, found, int(self.options.ratio), out_light, device)
+            launch_gather_light(len(batch.rows), batch, found, int(self.options.ratio), sources, out_light, device)
             rows.append(batch.rows.numpy())
             seen.append(found.visibility)
         order = np.concatenate(rows)

@@ -17,16 +17,25 @@ from numpy.typing import NDArray
 from beam_warp.device.arrays import upload
 from beam_warp.errors import InvalidArrayError
 from beam_warp.jobs.listeners import CountProgress
-from beam_warp.kernels.materials.roughness_profile import PARTS, ProfileFit, launch_lobe_shares, launch_profile
+from beam_warp.kernels.materials.roughness_profile import (
+    PARTS,
+    ProfileFit,
+    launch_lobe_shares,
+    launch_profile,
+    launch_reflections,
+)
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence
-from beam_warp.materials.light_rays import MaterialOptions, light_batches, lit_points, mean_radiance
+from beam_warp.materials.light_rays import MaterialOptions, light_batches, lit_points, mean_radiance, reflected_light
 from beam_warp.materials.normals import SurfacePoints
 from beam_warp.trace.scene import Scene
 from beam_warp.world.gaussians import GaussianCloud
 
 CANDIDATES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.85, 1.0)
 """Perceptual roughness that is tried: a lobe's peak goes with its inverse fourth power, so smooth ones lie closer."""
+
+REFLECTIONS_AT_ONCE = 1 << 22
+"""Reflections that are held at once, of points times views times candidates: 64 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +135,24 @@ def measure_roughness_profile(
         if progress is not None:
             progress(count - (total - done), count)
 
-    normals, observed, lobes = measured.surface.normals, measured.views, light.blurred
+    normals, observed, reflected = measured.surface.normals, measured.views, reflected_light(light)
     bounced = mean_radiance(cloud, views) if options.bounce else None
+    view_count = observed.colors.shape[0]
+    at_once = min(max(REFLECTIONS_AT_ONCE // (view_count * len(CANDIDATES)), 1), len(shown))
+    reflections = wp.empty((at_once, view_count, len(CANDIDATES)), dtype=wp.vec4, device=device)
     for batch, rays in light_batches(scene, points, light, measured, options, bounced, frame, report):
-        shares = wp.empty((len(batch.rows), observed.colors.shape[0]), dtype=wp.vec4, device=device)
-        launch_lobe_shares(shares.size, batch, rays, measured.light, normals, observed, shares, device)
-        items = len(batch.rows) * int(PARTS) * len(CANDIDATES)
-        launch_profile(items, batch, measured.light, lobes, normals, observed, shares, candidates, fit, device)
+        shares = wp.empty((len(batch.rows), view_count), dtype=wp.vec4, device=device)
+        launch_lobe_shares(
+            shares.size, batch, rays, measured.light, normals, observed, reflected.sources, shares, device
+        )
+        for start in range(0, len(batch.rows), at_once):
+            some = slice(start, start + at_once)
+            held = batch.rows[some]
+            seen = reflections[: len(held)]
+            inputs = (held, measured.light, reflected, normals, observed, shares[some], candidates, seen)
+            launch_reflections(seen.size, *inputs, device)
+            items = len(held) * int(PARTS) * len(CANDIDATES)
+            launch_profile(items, held, measured.light, normals, observed, seen, fit, device)
     misfit = np.zeros((int(PARTS), count, len(CANDIDATES)), np.float32)
     counted = np.zeros(count, np.float32)
     misfit[:, told], counted[told] = fit.misfit.numpy(), fit.views.numpy()

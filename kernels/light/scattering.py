@@ -3,6 +3,11 @@
 Lambert weighted by 1 - E_spec(n.v), which conserves energy (Kulla and Conty 2017), plus the dielectric GGX lobe of
 `beam_warp.kernels.light.brdf`. Directions are drawn from the two lobes by chance: the diffuse one by the cosine, the
 specular one by visible normals.
+
+A light of a size has a specular lobe wider than a point's: alpha'^2 = alpha^2 + (sin(half angle) / 2)^2. A half vector
+moves by half of what the light's direction does, so that variances add; of a mirror the lobe's peak is then the disc's
+radiance (F / (4 pi alpha'^2) E = F E / (pi sin^2) at normal incidence), and the distribution's norm keeps energy. Karis
+2013 widens by a sum instead, alpha + sin / 3, and bends the lobe towards the disc.
 """
 
 import warp as wp
@@ -11,6 +16,7 @@ from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.common.sampling import square_to_cosine_hemisphere
 from beam_warp.kernels.light.brdf import ALPHA_FLOOR, specular_albedo, specular_brdf
 from beam_warp.kernels.light.ggx_sampling import square_to_visible_reflection, square_to_visible_reflection_pdf
+from beam_warp.kernels.light.lights import LightDisc
 
 GRAZING_COSINE = wp.constant(1.0e-3)
 """A shading normal that leans away from the viewer is turned back until it faces him by this cosine."""
@@ -55,6 +61,14 @@ def brdf_cosine(shading: Shading, light: wp.vec3) -> wp.vec3:
     """BRDF times n.l, for light above the surface."""
     specular = specular_brdf(shading.normal, shading.view, light, shading.roughness)
     return (shading.diffuse + wp.vec3(specular)) * wp.dot(shading.normal, light)
+
+
+@wp.func
+def disc_specular(normal: wp.vec3, view: wp.vec3, alpha: float, disc: LightDisc) -> float:
+    """Specular BRDF times n.l for a light of a size."""
+    half = 0.5 * disc.sine
+    wide = wp.sqrt(alpha * alpha + half * half)
+    return specular_brdf(normal, view, disc.direction, wp.sqrt(wide)) * wp.max(wp.dot(normal, disc.direction), 0.0)
 
 
 @wp.func

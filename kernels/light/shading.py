@@ -1,6 +1,7 @@
 """Light of an environment with nothing in the way: irradiance for the diffuse lobe, split sum for the specular one.
 
-Formulas and sources stand in `beam_warp.light.prefiltered`.
+Formulas and sources stand in `beam_warp.light.prefiltered`, those of lobes that are seen at an angle in
+`beam_warp.kernels.light.stretched_lobe`.
 """
 
 import warp as wp
@@ -8,6 +9,7 @@ import warp as wp
 from beam_warp.kernels.common.constants import PI
 from beam_warp.kernels.light.brdf import specular_albedo
 from beam_warp.kernels.light.latlong import direction_to_latlong, latlong_bilinear, latlong_wrap
+from beam_warp.kernels.light.stretched_lobe import round_lobes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,7 +67,7 @@ def roughness_level(light: EnvironmentLight, roughness: float) -> float:
 
 @wp.func
 def blurred_radiance(light: EnvironmentLight, d: wp.vec3, roughness: float) -> wp.vec3:
-    """Mean radiance under the GGX lobe of a roughness about direction d."""
+    """Mean radiance under the round GGX lobe of a roughness about direction d."""
     position = roughness_level(light, roughness)
     level = wp.min(int(position), light.level_count - 2)
     f = position - float(level)
@@ -91,14 +93,21 @@ def seen_normal(raw_normal: wp.vec3, view: wp.vec3) -> wp.vec3:
 
 @wp.func
 def reflected_radiance(light: EnvironmentLight, normal: wp.vec3, view: wp.vec3, roughness: float) -> wp.vec3:
-    """Radiance that the specular lobe sees, before its albedo; a normal that faces away is turned to graze the view, so
-    that the mirror direction stays outside."""
+    """Mean radiance that the specular lobe sees; a normal that faces away is turned to graze the view, so that the
+    mirror direction stays outside."""
     cosine = wp.dot(normal, view)
     facing = normal
     if cosine < MIN_N_DOT_V:
         facing = wp.normalize(normal + (MIN_N_DOT_V - cosine) * view)
-    mirrored = 2.0 * wp.dot(facing, view) * facing - view
-    return blurred_radiance(light, wp.normalize(mirrored), roughness)
+        cosine = wp.dot(facing, view)
+    mirrored = 2.0 * cosine * facing - view
+    aside = cosine * view + (1.0 - 2.0 * cosine * cosine) * facing  # at right angles to it, as long as the sine
+    lobes = round_lobes(cosine, roughness)
+    total = wp.vec3()
+    for k in range(4):
+        d = wp.normalize(mirrored + lobes.offsets[k] * aside)
+        total += blurred_radiance(light, d, lobes.roughness[k]) * lobes.weights[k]
+    return total
 
 
 @wp.func

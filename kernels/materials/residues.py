@@ -1,8 +1,9 @@
 """Diffuse and specular residues of every view of a Gaussian under the traced light, and the fit of base colour to them.
 
 Rays are traced once per Gaussian; every view's residues (BEAM Eqs. 4 and 5) come from the same rays, because visibility
-does not depend on the view. Light without anything in the way is known in closed form (irradiance) or blurred
-beforehand (the specular lobe); rays only say which share of it arrives (ratio estimator, Heitz et al. 2018).
+does not depend on the view. Light without anything in the way is known in closed form (irradiance, small sources) or
+blurred beforehand (what else a specular lobe sees); rays only say which share of it arrives (ratio estimator, Heitz et
+al. 2018).
 """
 
 from typing import Any
@@ -22,8 +23,10 @@ from beam_warp.kernels.common.sampling import (
 )
 from beam_warp.kernels.common.spherical_harmonics import captured_radiance
 from beam_warp.kernels.common.spread import Spread, add_term, variance_of_sum
-from beam_warp.kernels.light.brdf import fresnel_schlick, specular_albedo, specular_brdf
-from beam_warp.kernels.light.shading import EnvironmentLight, blurred_radiance
+from beam_warp.kernels.light.brdf import ALPHA_FLOOR, fresnel_schlick, specular_albedo, specular_brdf
+from beam_warp.kernels.light.lights import Lights, light_disc
+from beam_warp.kernels.light.scattering import disc_specular
+from beam_warp.kernels.light.shading import EnvironmentLight, reflected_radiance
 from beam_warp.kernels.trace.occluders import sampled_hit
 from beam_warp.kernels.trace.settings import TraceSettings
 from beam_warp.kernels.trace.surface_rays import RayBatch, ray_origin
@@ -61,6 +64,14 @@ class LightRays:
 
 
 @wp.struct
+class ReflectedLight:
+    """What specular lobes see of an environment: its suns and lamps, and the rest of it, blurred."""
+
+    sources: Lights  # all of them distant, at most four
+    rest: EnvironmentLight
+
+
+@wp.struct
 class GatheredLight:
     """Light at each point, by row."""
 
@@ -69,6 +80,7 @@ class GatheredLight:
     bounce: wp.array[wp.vec3]  # irradiance over pi from what the rays hit
     bounce_error: wp.array[float]  # standard error of the sum of its channels
     noise: wp.array[float]  # standard error of the arriving light over itself
+    source_shares: wp.array[wp.vec4]  # part of each small source that nothing is in the way of
     tilt: wp.array[float]  # change of the logarithm of the arriving light for each radian that the normal turns
 
 
@@ -138,11 +150,25 @@ def trace_bounce_kernel(
     out_light.bounce_error[row] = wp.sqrt(wp.max(squares - sum * sum / rays, 0.0) / (rays * (rays - 1.0)))
 
 
+@wp.func
+def source_towards(sources: Lights, direction: wp.vec3) -> int:
+    """Which small source a ray goes to, -1 for none. What was taken for a source lies within twice its half angle."""
+    found = int(-1)
+    for k in range(sources.count):
+        middle = -sources.directions[k]
+        if wp.dot(middle, direction) > 0.0 and wp.length(wp.cross(middle, direction)) <= 2.0 * sources.sizes[k]:
+            found = k
+    return found
+
+
 @wp.kernel
-def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int, out_light: GatheredLight):
+def gather_light_kernel(
+    first: int, batch: RayBatch, rays: LightRays, ratio: int, sources: Lights, out_light: GatheredLight
+):
     """Arriving light: E_unshadowed * sum V f / sum f, or the mean of V f; its noise; what a turn of the normal does.
 
-    Where no ray found light, half of the unshadowed light is stated, give or take all of it.
+    Where no ray found light, half of the unshadowed light is stated, give or take all of it. A small source that no ray
+    went to is as open as the light in all.
     """
     place = first + wp.tid()
     row = batch.rows[place]
@@ -151,11 +177,17 @@ def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int
     free = wp.vec3()
     seen = wp.vec3()
     slope = wp.vec3()
+    source_free = wp.vec4()
+    source_seen = wp.vec4()
     for k in range(batch.sample_count):
         ray = begin + k
         f = rays.weights[ray]
         free += f
         seen += f * rays.visibility[ray]
+        source = source_towards(sources, rays.directions[ray])
+        if source >= 0:
+            source_free[source] += brightness(f)
+            source_seen[source] += brightness(f) * rays.visibility[ray]
         cosine = wp.dot(n, rays.directions[ray])
         if cosine > 0.0:
             slope += rays.directions[ray] * (brightness(f) * rays.visibility[ray] / cosine)
@@ -179,6 +211,13 @@ def gather_light_kernel(first: int, batch: RayBatch, rays: LightRays, ratio: int
     if total > 0.0:
         noise = wp.sqrt(variance_of_sum(spread)) / total
         tilt = wp.length(slope - n * wp.dot(n, slope)) / total
+    shares = wp.vec4(1.0, 1.0, 1.0, 1.0)
+    for k in range(4):
+        if source_free[k] > 0.0:
+            shares[k] = source_seen[k] / source_free[k]
+        elif brightness(free) > 0.0:
+            shares[k] = brightness(seen) / brightness(free)
+    out_light.source_shares[row] = shares
     out_light.arriving[row] = arriving
     out_light.noise[row] = noise
     out_light.tilt[row] = tilt
@@ -194,15 +233,15 @@ class ShadedPoints:
 
 @wp.func
 def seen_share(
-    rays: LightRays, begin: int, count: int, n: wp.vec3, v: wp.vec3, roughness: float, otherwise: float
+    rays: LightRays, sources: Lights, begin: int, count: int, n: wp.vec3, v: wp.vec3, roughness: float, otherwise: float
 ) -> float:
-    """Part of the specular lobe's light that nothing is in the way of; ``otherwise`` where no ray is in the lobe."""
+    """Part of the lobe's light that nothing is in the way of, small sources left out; ``otherwise`` without a ray in it."""
     free = float(0.0)
     seen = float(0.0)
     for k in range(count):
         ray = begin + k
         power = brightness(rays.weights[ray])
-        if power > 0.0:
+        if power > 0.0 and source_towards(sources, rays.directions[ray]) < 0:
             part = power * specular_brdf(n, v, rays.directions[ray], roughness)
             free += part
             seen += part * rays.visibility[ray]
@@ -230,13 +269,34 @@ def unreflected_share(rays: LightRays, begin: int, count: int, v: wp.vec3) -> fl
     return share
 
 
+@wp.func
+def specular_residue(
+    reflected: ReflectedLight,
+    light: GatheredLight,
+    row: int,
+    n: wp.vec3,
+    v: wp.vec3,
+    roughness: float,
+    open_share: float,
+) -> wp.vec3:
+    """L_S of a point: the environment that is open, and what bounces, by the lobe's albedo; and its small sources."""
+    albedo = specular_albedo(reflected.rest.albedo_terms, wp.dot(n, v), roughness)
+    lobe = reflected_radiance(reflected.rest, n, v, roughness)
+    total = (lobe * open_share + light.bounce[row]) * albedo
+    alpha = wp.max(roughness * roughness, ALPHA_FLOOR)
+    for k in range(reflected.sources.count):
+        disc = light_disc(reflected.sources, k, wp.vec3())
+        total += disc.irradiance * (disc_specular(n, v, alpha, disc) * light.source_shares[row][k])
+    return total
+
+
 @wp.kernel
 def view_residues_kernel(
     first: int,
     batch: RayBatch,
     rays: LightRays,
     light: GatheredLight,
-    lobes: EnvironmentLight,
+    reflected: ReflectedLight,
     surface: ShadedPoints,
     diffuse_weight: int,
     out_views: Observations,
@@ -259,11 +319,9 @@ def view_residues_kernel(
         openness = float(1.0)
         if free > 0.0:
             openness = brightness(light.arriving[row]) / free
-        albedo = specular_albedo(lobes.albedo_terms, cosine, roughness)
-        seen = seen_share(rays, begin, batch.sample_count, n, v, roughness, openness)
-        lobe = blurred_radiance(lobes, wp.normalize(2.0 * cosine * n - v), roughness)
-        specular = (lobe * seen + light.bounce[row]) * albedo
-        share = 1.0 - albedo
+        seen = seen_share(rays, reflected.sources, begin, batch.sample_count, n, v, roughness, openness)
+        specular = specular_residue(reflected, light, row, n, v, roughness, seen)
+        share = 1.0 - specular_albedo(reflected.rest.albedo_terms, cosine, roughness)
         if diffuse_weight == FRESNEL_HV:
             share = unreflected_share(rays, begin, batch.sample_count, v)
     out_views.specular[view, row] = specular
@@ -366,12 +424,12 @@ launch_gather_light = launcher(gather_light_kernel, block_dim=64)
 """Add up the light of a batch's rays."""
 
 
-def launch_view_residues(batch, rays, light, lobes, surface, diffuse_weight, out_views, device):
+def launch_view_residues(batch, rays, light, reflected, surface, diffuse_weight, out_views, device):
     """Write the residues of every view of a batch's points."""
     launch(
         view_residues_kernel,
         len(batch.rows) * out_views.colors.shape[0],
-        inputs=[batch, rays, light, lobes, surface, diffuse_weight],
+        inputs=[batch, rays, light, reflected, surface, diffuse_weight],
         outputs=[out_views],
         device=device,
         block_dim=128,

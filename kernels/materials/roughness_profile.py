@@ -3,7 +3,7 @@
 The rays that gathered a point's light also say which share of each view's specular lobe is open, as in
 `beam_warp.kernels.materials.residues`. That share changes slowly with roughness and costs a loop over the rays, so it
 is taken at four roughnesses and interpolated; the lobe's own radiance and its directional albedo, which change fast,
-are looked up for every candidate.
+are looked up for every candidate, once for all rounds of the fit.
 """
 
 import warp as wp
@@ -16,14 +16,17 @@ from beam_warp.kernels.light.brdf import (
     smith_visibility,
     specular_albedo,
 )
-from beam_warp.kernels.light.shading import EnvironmentLight, blurred_radiance
+from beam_warp.kernels.light.lights import Lights
 from beam_warp.kernels.materials.residues import (
     ROUNDS,
     GatheredLight,
     LightRays,
     Observations,
+    ReflectedLight,
     brightness,
     facing_weight,
+    source_towards,
+    specular_residue,
 )
 from beam_warp.kernels.trace.surface_rays import RayBatch
 
@@ -59,9 +62,10 @@ def lobe_shares_kernel(
     light: GatheredLight,
     normals: wp.array[wp.vec3],
     views: Observations,
+    sources: Lights,
     out_shares: wp.array2d[wp.vec4],
 ):
-    """Part of the specular lobe's light that nothing is in the way of, for one view of one point."""
+    """Part of the lobe's light that nothing is in the way of, for one view of one point; small sources are left out."""
     item = first + wp.tid()
     view_count = views.colors.shape[0]
     place = item / view_count
@@ -79,7 +83,7 @@ def lobe_shares_kernel(
         towards = rays.directions[begin + k]
         power = brightness(rays.weights[begin + k])
         n_dot_l = wp.dot(n, towards)
-        if power > 0.0 and n_dot_l > 0.0:
+        if power > 0.0 and n_dot_l > 0.0 and source_towards(sources, towards) < 0:
             h = wp.normalize(v + towards)
             part = lobes_without_fresnel(n_dot_l, cosine, wp.dot(n, h)) * (power * fresnel_schlick(wp.dot(v, h)))
             free += part
@@ -105,6 +109,42 @@ def share_at(shares: wp.vec4, roughness: float) -> float:
     return share
 
 
+@wp.func
+def view_weight(sample: wp.vec4, cosine: float) -> float:
+    """A view counts by the pixels that it shows, up to one: what it shows more often has the same errors."""
+    return wp.min(sample[3], 1.0) * facing_weight(cosine)
+
+
+@wp.kernel
+def reflections_kernel(
+    first: int,
+    rows: wp.array[int],
+    light: GatheredLight,
+    reflected: ReflectedLight,
+    normals: wp.array[wp.vec3],
+    views: Observations,
+    shares: wp.array2d[wp.vec4],
+    candidates: wp.array[float],
+    out_reflections: wp.array3d[wp.vec4],
+):
+    """L_S of one view of one point at one candidate, and the lobe's albedo; candidates are neighbours."""
+    item = first + wp.tid()
+    candidate = item % candidates.shape[0]
+    view = (item / candidates.shape[0]) % views.colors.shape[0]
+    place = item / (candidates.shape[0] * views.colors.shape[0])
+    row = rows[place]
+    n = normals[row]
+    v = views.directions[view, row]
+    cosine = wp.dot(n, v)
+    if not (view_weight(views.colors[view, row], cosine) > 0.0):
+        return
+    roughness = candidates[candidate]
+    open_share = share_at(shares[place, view], roughness)
+    specular = specular_residue(reflected, light, row, n, v, roughness, open_share)
+    albedo = specular_albedo(reflected.rest.albedo_terms, cosine, roughness)
+    out_reflections[place, view, candidate] = wp.vec4(specular[0], specular[1], specular[2], albedo)
+
+
 @wp.struct
 class ProfileFit:
     """Misfit of candidates to the views of a part, by row; rows of other points are left as they are."""
@@ -113,31 +153,22 @@ class ProfileFit:
     views: wp.array[float]  # sum of w over all views: how many views that see a whole pixel
 
 
-@wp.func
-def view_weight(sample: wp.vec4, cosine: float) -> float:
-    """A view counts by the pixels that it shows, up to one: what it shows more often has the same errors."""
-    return wp.min(sample[3], 1.0) * facing_weight(cosine)
-
-
 @wp.kernel
 def profile_kernel(
     first: int,
-    batch: RayBatch,
+    rows: wp.array[int],
     light: GatheredLight,
-    lobes: EnvironmentLight,
     normals: wp.array[wp.vec3],
     views: Observations,
-    shares: wp.array2d[wp.vec4],
-    candidates: wp.array[float],
+    reflections: wp.array3d[wp.vec4],
     out_fit: ProfileFit,
 ):
     """Robust misfit of one candidate for one part of the views of one point; candidates of a point are neighbours."""
     item = first + wp.tid()
-    candidate = item % candidates.shape[0]
-    part = (item / candidates.shape[0]) % PARTS
-    place = item / (candidates.shape[0] * PARTS)
-    roughness = candidates[candidate]
-    row = batch.rows[place]
+    candidate = item % reflections.shape[2]
+    part = (item / reflections.shape[2]) % PARTS
+    place = item / (reflections.shape[2] * PARTS)
+    row = rows[place]
     n = normals[row]
     arriving = light.arriving[row] + light.bounce[row]
     spread = SPREAD_PART * brightness(light.unshadowed[row]) / 3.0
@@ -153,15 +184,11 @@ def profile_kernel(
         weight_sum = float(0.0)
         for view in range(start, views.colors.shape[0], step):
             sample = views.colors[view, row]
-            v = views.directions[view, row]
-            cosine = wp.dot(n, v)
-            weight = view_weight(sample, cosine)
+            weight = view_weight(sample, wp.dot(n, views.directions[view, row]))
             if weight > 0.0 and spread > 0.0:
-                albedo = specular_albedo(lobes.albedo_terms, cosine, roughness)
-                lobe = blurred_radiance(lobes, wp.normalize(2.0 * cosine * n - v), roughness)
-                specular = (lobe * share_at(shares[place, view], roughness) + light.bounce[row]) * albedo
-                diffuse = arriving * (1.0 - albedo)
-                target = wp.vec3(sample[0], sample[1], sample[2]) - specular
+                reflection = reflections[place, view, candidate]
+                diffuse = arriving * (1.0 - reflection[3])
+                target = wp.vec3(sample[0] - reflection[0], sample[1] - reflection[1], sample[2] - reflection[2])
                 weight_sum += weight
                 if turn > 0:
                     off = target - wp.cw_mul(base_color, diffuse)
@@ -187,5 +214,12 @@ Views that count for nothing are left as they are.
 """
 
 
+launch_reflections = launcher(reflections_kernel, block_dim=128)
+"""Write what every candidate reflects towards every view of some points, ``(points, views, candidates)`` vec4.
+
+Views that count for nothing are left as they are.
+"""
+
+
 launch_profile = launcher(profile_kernel, block_dim=128)
-"""Write the misfit of every candidate and part of the views of a batch's points."""
+"""Write the misfit of every candidate and part of the views of some points."""

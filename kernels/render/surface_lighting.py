@@ -1,16 +1,9 @@
-"""What lights and an environment make of a surface point in a deferred renderer: functions that its kernels share.
-
-A light of a size has a specular lobe wider than a point's: alpha'^2 = alpha^2 + (sin(half angle) / 2)^2. A half vector
-moves by half of what the light's direction does, so that variances add; of a mirror the lobe's peak is then the disc's
-radiance (F / (4 pi alpha'^2) E = F E / (pi sin^2) at normal incidence), and the distribution's norm keeps energy. Karis
-2013 widens by a sum instead, alpha + sin / 3, and bends the lobe towards the disc.
-"""
+"""What lights and an environment make of a surface point in a deferred renderer: functions that its kernels share."""
 
 import warp as wp
 
-from beam_warp.kernels.light.brdf import specular_brdf
 from beam_warp.kernels.light.lights import LightDisc, Lights, light_disc
-from beam_warp.kernels.light.scattering import Shading
+from beam_warp.kernels.light.scattering import Shading, disc_specular
 from beam_warp.kernels.light.shading import EnvironmentLight
 from beam_warp.kernels.render.shadow_maps import ShadowMaps, face_towards, visible_share
 
@@ -67,15 +60,6 @@ def disc_cosine(disc: LightDisc, normal: wp.vec3) -> float:
 
 
 @wp.func
-def disc_specular(shading: Shading, disc: LightDisc) -> float:
-    """Specular BRDF times n.l for a light of a size."""
-    half = 0.5 * disc.sine
-    alpha = wp.sqrt(shading.alpha * shading.alpha + half * half)
-    value = specular_brdf(shading.normal, shading.view, disc.direction, wp.sqrt(alpha))
-    return value * wp.max(wp.dot(shading.normal, disc.direction), 0.0)
-
-
-@wp.func
 def lit_radiance(lights: Lights, shadows: LightShadows, shading: Shading, point: wp.vec3, turn: wp.vec2) -> wp.vec3:
     """Radiance that a point scatters of all lights."""
     total = wp.vec3()
@@ -85,7 +69,9 @@ def lit_radiance(lights: Lights, shadows: LightShadows, shading: Shading, point:
         if cosine > 0.0 and wp.max(disc.irradiance) > 0.0:
             share = light_visibility(lights, shadows, k, point, shading.normal, turn)
             if share > 0.0:
-                scattered = shading.diffuse * cosine + wp.vec3(disc_specular(shading, disc))
+                scattered = shading.diffuse * cosine + wp.vec3(
+                    disc_specular(shading.normal, shading.view, shading.alpha, disc)
+                )
                 total += wp.cw_mul(scattered, disc.irradiance) * share
     return total
 

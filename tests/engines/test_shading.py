@@ -10,7 +10,7 @@ from engines.probes import ENVIRONMENTS, PROBES, REGIONS, SIDE, TAPS, goldens
 
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.image.tone import TRANSFORMS, display_linear
-from beam_warp.kernels.light import brdf, lights, scattering, shading
+from beam_warp.kernels.light import brdf, lights, scattering, shading, stretched_lobe
 from beam_warp.kernels.render import shadow_maps
 from beam_warp.light.ggx import TABLE_SIZE, ggx_distribution, schlick_weight, smith_lambda
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS
@@ -54,7 +54,7 @@ def unit(v):
 def test_constants_are_those_of_the_kernels():
     source = generate.SOURCE.read_text(encoding="utf-8")
     found = {name: float(value) for name, value in re.findall(r"static const \w+ (\w+) = ([-\d.e]+);", source)}
-    for module in (brdf, lights, scattering, shading, shadow_maps):
+    for module in (brdf, lights, scattering, shading, shadow_maps, stretched_lobe):
         for name in found.keys() & vars(module).keys():
             assert found.pop(name) == pytest.approx(float(getattr(module, name)), rel=1e-7), name
     ratio = np.log(LEVEL_ROUGHNESS[2] / LEVEL_ROUGHNESS[1])
@@ -65,6 +65,9 @@ def test_constants_are_those_of_the_kernels():
     assert (found.pop("REGION_SEARCH_TAPS"), found.pop("REGION_FILTER_TAPS")) == REGION_TAPS
     assert [found.pop(name.upper()) for name in TRANSFORMS] == [0, 1, 2, 3]
     assert found == {"WHITEST": 2.0**24}
+    polynomials = re.findall(r"biquadratic\(x, r, (.*)\)", source)
+    numbers = [float(number) for text in polynomials for number in re.findall(r"-?\d+\.\d+", text)]
+    assert numbers == list(stretched_lobe.COEFFICIENTS)
 
 
 def test_generated_files_are_of_the_sources_as_they_are():

@@ -14,12 +14,17 @@ from support.structures import filled
 from beam_warp import Scene
 from beam_warp.errors import InvalidArrayError, InvalidOptionError
 from beam_warp.kernels.materials.residues import GatheredLight, LightRays, Observations
-from beam_warp.kernels.materials.roughness_profile import ProfileFit, launch_lobe_shares, launch_profile
+from beam_warp.kernels.materials.roughness_profile import (
+    ProfileFit,
+    launch_lobe_shares,
+    launch_profile,
+    launch_reflections,
+)
 from beam_warp.kernels.trace.surface_rays import RayBatch
 from beam_warp.light.ggx import specular_albedo
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.materials.evidence import ViewEvidence
-from beam_warp.materials.light_rays import MaterialOptions
+from beam_warp.materials.light_rays import MaterialOptions, reflected_light
 from beam_warp.materials.normals import Neighborhoods, SurfacePoints
 from beam_warp.materials.roughness import GRID, MODEL_ERROR, SHARED, RoughnessPrior, as_seen, solve_roughness
 from beam_warp.materials.roughness_profile import CANDIDATES, RoughnessProfile, measure_roughness_profile
@@ -332,13 +337,17 @@ def test_shares_and_misfits_are_those_of_float64(rng, device):
     point_light = filled(GatheredLight, device, unshadowed=white, arriving=0.8 * white, bounce=0.1 * white)
     views = filled(Observations, device, colors=host["colors"], directions=host["towards"])
     shares = wp.full((point_count, view_count), wp.vec4(), dtype=wp.vec4, device=device)
-    launch_lobe_shares(shares.size, batch, rays, point_light, batch.normals, views, shares, device)
+    reflected = reflected_light(light)
+    inputs = (batch, rays, point_light, batch.normals, views, reflected.sources)
+    launch_lobe_shares(shares.size, *inputs, shares, device)
     fit = ProfileFit()
     fit.misfit = wp.zeros((3, point_count, len(CANDIDATES)), dtype=float, device=device)
     fit.views = wp.zeros(point_count, dtype=float, device=device)
     candidates = wp.array(np.array(CANDIDATES, np.float32), dtype=float, device=device)
-    inputs = (batch, point_light, light.blurred, batch.normals, views, shares, candidates)
-    launch_profile(fit.misfit.size, *inputs, fit, device)
+    reflections = wp.zeros((point_count, view_count, len(CANDIDATES)), dtype=wp.vec4, device=device)
+    inputs = (batch.rows, point_light, reflected, batch.normals, views, shares, candidates)
+    launch_reflections(reflections.size, *inputs, reflections, device)
+    launch_profile(fit.misfit.size, batch.rows, point_light, batch.normals, views, reflections, fit, device)
     normals, towards, directions = (host[name].astype(np.float64) for name in ("normals", "towards", "rays"))
     cosine = (towards * normals).sum(-1)
     faces = np.clip((cosine - 0.2) / 0.3, 0.0, 1.0)

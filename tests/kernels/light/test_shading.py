@@ -5,10 +5,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from reference.specular_lobe import reflected_lobe, unit_nodes
+from reference.specular_lobe import reflected_lobe
 from support.split_sum import LINEAR, blurred_level, shade, smooth_environment, sunny_environment
 
-from beam_warp.light.ggx import DIELECTRIC_F0, ggx_distribution, specular_albedo
+from beam_warp.kernels.light.stretched_lobe import COEFFICIENTS, LOBES
+from beam_warp.light.ggx import DIELECTRIC_F0, specular_albedo
 from beam_warp.light.prefiltered import LEVEL_ROUGHNESS
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.world.environment import EnvironmentMap
@@ -88,13 +89,28 @@ def shade_twin(lighting, *, base_color, roughness, ambient_occlusion, normals, a
     r, openness = roughness.astype(np.float64), ambient_occlusion.astype(np.float64)
     cosine = (n * v).sum(-1)
     bent = np.where((cosine < 1e-4)[..., None], unit(n + (1e-4 - cosine)[..., None] * v), n)
-    mirrored = 2 * (bent * v).sum(-1)[..., None] * bent - v
+    facing = (bent * v).sum(-1)[..., None]
+    mirrored, aside = 2 * facing * bent - v, facing * v + (1 - 2 * facing**2) * bent
     n_dot_v = np.clip(cosine, 1e-4, 1)
     albedo = specular_albedo(n_dot_v, r)
     occlusion = np.clip((n_dot_v + openness) ** np.exp2(-16 * r - 1) - 1 + openness, 0, 1)
     irradiance = bilinear_twin(lighting.blurred.irradiance.numpy().astype(np.float64), n)
     diffuse = base_color * irradiance * ((1 - albedo) * openness / np.pi)[..., None]
-    specular = blurred_twin(lighting, mirrored, r) * (albedo * occlusion)[..., None]
+    x = np.sqrt(np.maximum(facing[..., 0], 0.01))
+    powers = np.stack([x**i * r**k for i in range(3) for k in range(3)], axis=-1)
+    numbers = powers @ np.reshape(COEFFICIENTS, (11, 9)).T
+    weights = np.exp(np.concatenate([numbers[..., 8:], np.zeros((*r.shape, 1))], axis=-1))
+    weights /= weights.sum(-1, keepdims=True)
+    reflected = sum(
+        weights[..., k, None]
+        * blurred_twin(
+            lighting,
+            unit(mirrored + (r**2 * numbers[..., k])[..., None] * aside),
+            np.clip(r * numbers[..., 4 + k], 0, 1),
+        )
+        for k in range(LOBES)
+    )
+    specular = reflected * (albedo * occlusion)[..., None]
     return (diffuse + specular) * alpha[..., None]
 
 
@@ -117,26 +133,10 @@ class TestShade:
         expected = shade_twin(lighting, **surfaces)
         np.testing.assert_allclose(shade(lighting, **surfaces), expected, atol=1e-5, rtol=1e-5)
 
-    def test_split_sum_in_closed_form_on_linear_light(self, device):
-        # Under L = 1 + g·ω the mean over a lobe about R is 1 + m g·R, m the mean cosine with R.
-        roughness = np.array(LEVEL_ROUGHNESS[1:])
-        x, weights = unit_nodes(400)
-        lobe = ggx_distribution(np.sqrt(0.5 * (1 + x)), roughness[:, None] ** 2) * x * weights
-        mean_cosine = (lobe * x).sum(axis=1) / lobe.sum(axis=1)
-        for n_dot_v in (1.0, 0.6, 0.2):
-            radiance = shade(smooth_light(device), **facing_surfaces(n_dot_v, roughness, 0.0))[0, :, 0]
-            mirrored = np.array([-np.sqrt(1 - n_dot_v**2), 0.0, n_dot_v])
-            expected = specular_albedo(n_dot_v, roughness) * (1 + mean_cosine * (LINEAR @ mirrored))
-            # Bilinear lookup of a level with texels of π / 32 loses (π / 32)² / 8 of a linear function; the cells
-            # of the tree count as points.
-            np.testing.assert_allclose(radiance, expected, rtol=5e-3)
-
-    @pytest.mark.parametrize(
-        ("n_dot_v", "roughness", "bound"),
-        [(1.0, 0.2, 0.002), (1.0, 0.5, 0.01), (1.0, 1.0, 0.02), (0.5, 0.2, 0.005), (0.5, 0.5, 0.01), (0.2, 0.3, 0.03)],
-    )
-    def test_against_the_full_rendering_equation(self, device, n_dot_v, roughness, bound):
-        """The split sum may be off by the shift of the lobe's mean direction, times the gradient of smooth light."""
+    @pytest.mark.parametrize("n_dot_v", [0.1, 0.2, 0.4, 0.7, 1.0])
+    @pytest.mark.parametrize("roughness", [0.1, 0.2, 0.35, 0.5, 0.75, 1.0])
+    def test_against_the_full_rendering_equation(self, device, n_dot_v, roughness):
+        """Under L = 1 + g·ω a lobe sees 1 + g·m, m its mean direction, which is not the mirror direction."""
         base_color = 0.5
         radiance = shade(smooth_light(device), **facing_surfaces(n_dot_v, roughness, base_color))[0, 0, 0]
         directions, shares = reflected_lobe(n_dot_v, roughness, DIELECTRIC_F0, count=400)
@@ -144,7 +144,10 @@ class TestShade:
         albedo = specular_albedo(n_dot_v, roughness)
         specular = albedo * (1 + LINEAR @ mean_direction)
         diffuse = (1 - albedo) * base_color * (1 + LINEAR[2] * 2 / 3)
-        assert abs(radiance / (diffuse + specular) - 1) < bound
+        # Bilinear lookup of a level with texels of π / 32 loses (π / 32)² / 8 of a linear function; cells of the tree
+        # count as points; the mean direction of round lobes is off by 0.05 at the most, where the view grazes.
+        most = 0.05 if n_dot_v < 0.15 else 0.03
+        assert abs(radiance - diffuse - specular) < most * np.linalg.norm(LINEAR) * albedo + 1e-3 * diffuse
 
     def test_degenerate_normals_stay_finite(self, device, rng):
         lighting = PreparedEnvironment(sunny_environment(rng, height=16), device=device)
