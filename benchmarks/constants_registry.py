@@ -348,7 +348,7 @@ MATERIALS = (
     Constant(ROUGHNESS + "RoughnessPrior(mean)", JUDGED, "Roughness where nothing is known."),
     Constant(ROUGHNESS + "RoughnessPrior(spread)", JUDGED, "Its spread."),
     Constant(ROUGHNESS + "INFORMED_PART", JUDGED, "Spread from which on the prior tells.", NO_SCORE),
-    Constant(ROUGHNESS + "MODEL_ERROR", "split sum against the whole integral", "Error that is stated.", NO_SCORE),
+    Constant(ROUGHNESS + "MODEL_ERROR", "what is pooled is not of one roughness", "Error that is stated.", NO_SCORE),
     Constant("beam_warp.materials.base_color:UNLIT_PART", JUDGED, "Part of the mean light below which it is unlit."),
     Constant("beam_warp.materials.base_color:FACING_PART", JUDGED, "Part that must be seen from the front."),
     Constant("beam_warp.materials.base_color:FILL_NEIGHBORS", JUDGED, "Neighbours that fill what was not seen."),

@@ -146,7 +146,7 @@ def measure_roughness_profile(
             shares.size, batch, rays, measured.light, normals, observed, reflected.sources, shares, device
         )
         for start in range(0, len(batch.rows), at_once):
-            some = slice(start, start + at_once)
+            some = slice(start, min(start + at_once, len(batch.rows)))
             held = batch.rows[some]
             seen = reflections[: len(held)]
             inputs = (held, measured.light, reflected, normals, observed, shares[some], candidates, seen)

@@ -158,10 +158,7 @@ class TestKnownSpheres:
         assert np.median(solve_roughness(*profile_of(SKY, 0.35, device, tilt=0.25)).roughness) < 0.43
 
     def test_stated_errors_cover_what_many_places_are_off(self, device):
-        """Neighbours are wrong together: 1600 Gaussians are 100 places of 16, and their share binomial.
-
-        Only of two errors: the split sum is off to one side in all places, so within one there are fewer.
-        """
+        """Neighbours are wrong together: 1600 Gaussians are 100 places of 16, and their share binomial."""
         at = sphere_points(1600)[0]
         truth = 0.5 + 0.25 * np.sin(2.0 * at[:, 0] + at[:, 1]) * np.cos(2.0 * at[:, 2])
         positions, profile = profile_of(SKY, truth, device, count=1600, view_count=16, noise=0.03)

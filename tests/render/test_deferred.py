@@ -160,7 +160,8 @@ def test_a_wide_light_in_a_glossy_plane(device, roughness, diameter, most):
 @pytest.mark.parametrize(("roughness", "most"), [(0.3, 0.08), (0.6, 0.02)])
 def test_a_low_sun_of_an_environment_in_a_glossy_plane(device, roughness, most):
     """Sum over texels of L cos (rho (1 - E_spec) / pi + f_s), float64: a sun of 2 degrees, 7 above a plane that is seen
-    from 15 above it. The split sum has half of it or less; a lobe widened by a disc is not stretched as it grazes.
+    from 15 above it. Round lobes show it through the gaps between them: half of it, or a sixth too much; a lobe that is
+    widened by a disc is not stretched as it grazes.
     """
     environment, color = LOW_SUN, np.array([0.9, 0.5, 0.2])
     eye = 2.0 * np.array([0.0, -np.cos(np.radians(15.0)), np.sin(np.radians(15.0))])
@@ -176,7 +177,7 @@ def test_a_low_sun_of_an_environment_in_a_glossy_plane(device, roughness, most):
     np.testing.assert_allclose(found, expected, rtol=most)
     turned = replace(shot, environment=environment.rotated(-90.0), environment_rotation=90.0)
     np.testing.assert_allclose(middle(render(turned, device, SMALL)), found, rtol=1e-4)
-    assert (middle(render(shot, device)) < 0.5 * expected).all()  # what the split sum alone makes of it
+    assert (np.abs(middle(render(shot, device)) / expected - 1.0) > 0.12).all()  # what the split sum alone makes of it
 
 
 def test_shadows_of_gaussians_on_gaussians(device):
