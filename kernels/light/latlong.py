@@ -35,9 +35,10 @@ def latlong_wrap(row: int, column: int, height: int, width: int) -> wp.vec2i:
     elif r >= height:
         r = 2 * height - 1 - r
         c += width / 2
-    c = c % width
-    if c < 0:
+    if c < 0:  # one step and half a turn at most: a remainder would cost a division
         c += width
+    elif c >= width:
+        c -= width
     return wp.vec2i(r, c)
 
 

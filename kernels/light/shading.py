@@ -38,11 +38,10 @@ def level_texel(light: EnvironmentLight, start: int, height: int, row: int, colu
 
 
 @wp.func
-def level_radiance(light: EnvironmentLight, level: int, d: wp.vec3) -> wp.vec3:
-    """Bilinear radiance of one level."""
+def level_radiance(light: EnvironmentLight, level: int, uv: wp.vec2) -> wp.vec3:
+    """Bilinear radiance of one level at a place of the lat-long map."""
     height = light.heights[level]
     start = light.offsets[level]
-    uv = direction_to_latlong(d)
     x = uv[0] * float(2 * height) - 0.5
     y = uv[1] * float(height) - 0.5
     column = int(wp.floor(x))
@@ -71,7 +70,8 @@ def blurred_radiance(light: EnvironmentLight, d: wp.vec3, roughness: float) -> w
     position = roughness_level(light, roughness)
     level = wp.min(int(position), light.level_count - 2)
     f = position - float(level)
-    return level_radiance(light, level, d) * (1.0 - f) + level_radiance(light, level + 1, d) * f
+    uv = direction_to_latlong(d)
+    return level_radiance(light, level, uv) * (1.0 - f) + level_radiance(light, level + 1, uv) * f
 
 
 @wp.func
