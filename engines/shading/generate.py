@@ -4,7 +4,7 @@
 
 Needs ``slangc`` of the package slangtorch (Apache 2.0). slangc emits what an entry point reaches, so a kernel that
 calls every function is added, and cut out again; numbers that slangc appends to names of functions, structs and members
-go. The functions that an engine defines (`HOOKS`) are declared in C-like languages, and otherwise left open; what
+go, and so do digits that no float has. The functions that an engine defines (`HOOKS`) are declared in C-like languages, and otherwise left open; what
 calls them stands in a part of its own.
 """
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import re
+import struct
 import subprocess
 import sys
 import tempfile
@@ -118,6 +119,18 @@ def renamed(block: str, names: set[str]) -> str:
     return re.sub(member, r"\1", block)
 
 
+def shortened(text: str) -> str:
+    """Return a block whose numbers have no more digits than tell them apart as 32-bit floats."""
+
+    def shortest(found: re.Match[str]) -> str:
+        single = struct.pack("f", float(found[0]))
+        tries = (f"{float(found[0]):.{digits}g}" for digits in range(1, 10))
+        short = next(text for text in tries if struct.pack("f", float(text)) == single)
+        return short if set(short) & set(".e") else short + ".0"
+
+    return re.sub(r"\b\d+\.\d{5,}(?:[eE][-+]?\d+)?", shortest, text)
+
+
 def fetchers(source: str, hooks: Mapping[str, str]) -> set[str]:
     """Return the names of functions that call a hook, or one that does."""
     found, code = set(hooks), re.sub(r"//.*", "", source)
@@ -141,7 +154,8 @@ def texts(compiler: Path, target: str, source: str, hooks: Mapping[str, str]) ->
     comments |= {name: comment for comment, _, name, _ in FUNCTION.findall(source)}
     found = {}
     for name, comment in comments.items():
-        text = comment.replace("/// ", "// ").replace("`", "'") + renamed(made[name], {*comments, *hooks})
+        code = shortened(renamed(made[name], {*comments, *hooks}))
+        text = comment.replace("/// ", "// ").replace("`", "'") + code
         found[name] = es(text) if target == "glsl" else text
     return found
 
@@ -174,8 +188,8 @@ def head() -> str:
 
 
 def bare(text: str) -> str:
-    """Return a shader without its comments: pages load it, and `relight.slang` has them."""
-    return re.sub(r"^ *//.*\n", "", text, flags=re.MULTILINE)
+    """Return a shader without its comments and its indentation: pages load it, and `relight.slang` has both."""
+    return re.sub(r"^ +", "", re.sub(r"^ *//.*\n", "", text, flags=re.MULTILINE), flags=re.MULTILINE)
 
 
 def files(compiler: Path) -> dict[Path, str]:

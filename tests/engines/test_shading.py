@@ -65,7 +65,7 @@ def test_constants_are_those_of_the_kernels():
     assert (found.pop("REGION_SEARCH_TAPS"), found.pop("REGION_FILTER_TAPS")) == REGION_TAPS
     assert [found.pop(name.upper()) for name in TRANSFORMS] == [0, 1, 2, 3]
     assert found == {"WHITEST": 2.0**24}
-    polynomials = re.findall(r"biquadratic\(x, r, (.*)\)", source)
+    polynomials = re.findall(r"biquadratic\(x, r, (float3\(.*?\), float3\(.*?\), float3\(.*?\))\)", source)
     numbers = [float(number) for text in polynomials for number in re.findall(r"-?\d+\.\d+", text)]
     assert numbers == list(stretched_lobe.COEFFICIENTS)
 
