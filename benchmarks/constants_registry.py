@@ -672,6 +672,7 @@ UNTUNED = {
         beam_warp.materials.base_color: PAIRED PAIR_GROUPS MISSING
         beam_warp.materials.changes: LEAST_ERROR
         beam_warp.materials.evidence: SURFACE_CHANNELS PIXELS_AT_ONCE CUTTING_THREADS MARGIN
+        beam_warp.materials.roughness_profile: REFLECTIONS_AT_ONCE
         beam_warp.materials.light_rays: FEWEST_FIRST_RAYS
         beam_warp.materials.exposure: ASKED
         beam_warp.materials.images: UNLIT_PART WHOLE_ALPHA CROP_MARGIN UNSEEN_EVIDENCE

@@ -84,8 +84,8 @@ INFORMED_PART = 0.9
 """Part of the prior's spread; a Gaussian whose distribution is wider is told by the prior."""
 
 MODEL_ERROR = 0.04
-"""Error of roughness that no misfit shows: what is pooled is not of one roughness. Under a sky of five soft lights, where
-roughness changes by 0.25 over the subject, 95 % of places come back within two stated errors with it, 85 % with 0.015.
+"""Error of roughness that no misfit shows: what is pooled is not of one roughness. Under a sky of five soft lights,
+where roughness changes by 0.25 over the subject, 95 % of places come back within two stated errors, 85 % with 0.015.
 Of one roughness, fourteen from 0.16 to 0.91 come back 0.012 off in root mean square: half a step of `GRID`."""
 
 TINY = 1e-300

@@ -4,8 +4,8 @@
 
 Needs ``slangc`` of the package slangtorch (Apache 2.0). slangc emits what an entry point reaches, so a kernel that
 calls every function is added, and cut out again; numbers that slangc appends to names of functions, structs and members
-go, and so do digits that no float has. The functions that an engine defines (`HOOKS`) are declared in C-like languages, and otherwise left open; what
-calls them stands in a part of its own.
+go, and so do digits that no float has. The functions that an engine defines (`HOOKS`) are declared in C-like languages,
+and otherwise left open; what calls them stands in a part of its own.
 """
 
 from __future__ import annotations

@@ -235,7 +235,7 @@ class ShadedPoints:
 def seen_share(
     rays: LightRays, sources: Lights, begin: int, count: int, n: wp.vec3, v: wp.vec3, roughness: float, otherwise: float
 ) -> float:
-    """Part of the lobe's light that nothing is in the way of, small sources left out; ``otherwise`` without a ray in it."""
+    """Part of the lobe's light that is open, small sources left out; ``otherwise`` where no ray is in the lobe."""
     free = float(0.0)
     seen = float(0.0)
     for k in range(count):
