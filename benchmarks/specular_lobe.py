@@ -168,7 +168,7 @@ def main() -> None:
     parser = record.parser(__doc__)
     parser.add_argument("--iterations", type=int, default=0, help="fit the polynomials first")
     arguments = parser.parse_args()
-    coefficients = np.array(COEFFICIENTS).reshape(len(START), 9)
+    coefficients = np.array(COEFFICIENTS)
     if arguments.iterations:
         coefficients = fitted(arguments.iterations)
         print(np.array2string(coefficients, precision=4, separator=", ", max_line_width=118, suppress_small=True))

@@ -58,7 +58,7 @@ def specular_lobe(result: Row) -> Rows:
     for roughness in sorted({row["roughness"] for row in result["left"]}):
         found = {row["cosine"]: row for row in result["left"] if row["roughness"] == roughness}
         cells = (
-            f"{percent(row['four'])} of {percent(row['one'])}; {row['four_mean']:.3f} of {row['one_mean']:.3f}"
+            f"{100.0 * row['four']:.0f} / {percent(row['one'])}; {row['four_mean']:.3f} / {row['one_mean']:.3f}"
             for row in (found[cosine] for cosine in cosines)
         )
         rows.append((f"{roughness:.1f}", *cells))

@@ -7,11 +7,11 @@ angles to it, lobe k has the
 
     direction m + r^2 sqrt(1 - c^2) o_k a, roughness r q_k and weight w_k / sum w, w_k = exp(l_k), l_3 = 0,
 
-where o_k, q_k and l_k are polynomials of second degree in x and in r. They are fitted to the lobe D G F itself, not to
-lights (`benchmarks/specular_lobe.py`): between cosines of 0.3 and 0.8, 3 to 23 % of the lobe is left in root mean
-square, of one round lobe 14 to 75 %.
+where o_k, q_k and l_k are polynomials of second degree in x and in r. They are fitted to the lobe D G F and its mean
+direction, not to lights (`benchmarks/specular_lobe.py`). docs/rendering.md states what is left, and what one round lobe
+leaves.
 
-Source of what it is fitted to: Walter et al. 2007 (GGX), Heitz 2014 (masking), Schlick 1994 (Fresnel).
+Sources of what they are fitted to: Walter et al. 2007 (GGX), Heitz 2014 (masking), Schlick 1994 (Fresnel).
 """
 
 import warp as wp
@@ -24,112 +24,23 @@ LEAST_COSINE = wp.constant(0.01)
 """Smallest cosine that was fitted; below it the lobes are those at it."""
 
 COEFFICIENTS = (
-    -0.1876,
-    2.3625,
-    -3.7977,
-    -1.7099,
-    2.4505,
-    5.3627,
-    -4.0792,
-    1.9408,
-    -3.9639,
-    0.311,
-    0.7843,
-    -1.2121,
-    -0.8633,
-    1.4773,
-    0.8768,
-    -1.7236,
-    -0.0937,
-    -0.6648,
-    0.8287,
-    1.7877,
-    -2.3684,
-    -1.6635,
-    1.0332,
-    0.6681,
-    0.7452,
-    -1.0718,
-    -0.2163,
-    1.5144,
-    4.402,
-    3.657,
-    -3.0614,
-    -2.314,
-    -7.5969,
-    4.0117,
-    -1.2263,
-    1.9955,
-    0.2836,
-    -0.7051,
-    0.7497,
-    0.6519,
-    -0.7085,
-    -0.0951,
-    0.62,
-    0.4972,
-    -1.242,
-    0.2135,
-    0.0901,
-    0.0198,
-    0.3116,
-    -0.33,
-    0.4068,
-    0.6197,
-    -0.403,
-    -0.4233,
-    0.2706,
-    0.3748,
-    0.0342,
-    0.0456,
-    -0.0849,
-    -0.8569,
-    0.6699,
-    -0.4658,
-    1.2509,
-    0.5186,
-    -0.6768,
-    2.9018,
-    -0.1431,
-    1.4843,
-    -4.4539,
-    0.4773,
-    1.1776,
-    0.4673,
-    -1.1821,
-    -8.9746,
-    1.6353,
-    7.7178,
-    24.4479,
-    -19.8497,
-    -11.4382,
-    2.7746,
-    -5.9217,
-    -2.2784,
-    3.2477,
-    -3.0005,
-    5.2823,
-    1.8989,
-    -1.647,
-    -2.1948,
-    -10.5176,
-    4.9053,
-    -0.9109,
-    6.429,
-    -4.9052,
-    -1.5132,
-    -4.6117,
-    -1.3976,
-    3.8924,
-    -2.2867,
-    4.4409,
+    (-0.1876, 2.3625, -3.7977, -1.7099, 2.4505, 5.3627, -4.0792, 1.9408, -3.9639),
+    (0.311, 0.7843, -1.2121, -0.8633, 1.4773, 0.8768, -1.7236, -0.0937, -0.6648),
+    (0.8287, 1.7877, -2.3684, -1.6635, 1.0332, 0.6681, 0.7452, -1.0718, -0.2163),
+    (1.5144, 4.402, 3.657, -3.0614, -2.314, -7.5969, 4.0117, -1.2263, 1.9955),
+    (0.2836, -0.7051, 0.7497, 0.6519, -0.7085, -0.0951, 0.62, 0.4972, -1.242),
+    (0.2135, 0.0901, 0.0198, 0.3116, -0.33, 0.4068, 0.6197, -0.403, -0.4233),
+    (0.2706, 0.3748, 0.0342, 0.0456, -0.0849, -0.8569, 0.6699, -0.4658, 1.2509),
+    (0.5186, -0.6768, 2.9018, -0.1431, 1.4843, -4.4539, 0.4773, 1.1776, 0.4673),
+    (-1.1821, -8.9746, 1.6353, 7.7178, 24.4479, -19.8497, -11.4382, 2.7746, -5.9217),
+    (-2.2784, 3.2477, -3.0005, 5.2823, 1.8989, -1.647, -2.1948, -10.5176, 4.9053),
+    (-0.9109, 6.429, -4.9052, -1.5132, -4.6117, -1.3976, 3.8924, -2.2867, 4.4409),
 )
 """Rows: o_0 to o_3, q_0 to q_3, l_0 to l_2. Columns: of 1, r, r^2, x, x r, x r^2, x^2, x^2 r, x^2 r^2."""
 
 vec9 = wp.types.vector(9, dtype=float)
-vec11 = wp.types.vector(11, dtype=float)
 
-POLYNOMIALS = wp.constant(wp.types.matrix((11, 9), dtype=float)(COEFFICIENTS))
+POLYNOMIALS = wp.constant(wp.types.matrix((11, 9), dtype=float)([number for row in COEFFICIENTS for number in row]))
 
 
 @wp.struct

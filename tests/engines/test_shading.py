@@ -67,7 +67,7 @@ def test_constants_are_those_of_the_kernels():
     assert found == {"WHITEST": 2.0**24}
     polynomials = re.findall(r"biquadratic\(x, r, (float3\(.*?\), float3\(.*?\), float3\(.*?\))\)", source)
     numbers = [float(number) for text in polynomials for number in re.findall(r"-?\d+\.\d+", text)]
-    assert numbers == list(stretched_lobe.COEFFICIENTS)
+    assert numbers == [number for row in stretched_lobe.COEFFICIENTS for number in row]
 
 
 def test_generated_files_are_of_the_sources_as_they_are():

@@ -98,7 +98,7 @@ def shade_twin(lighting, *, base_color, roughness, ambient_occlusion, normals, a
     diffuse = base_color * irradiance * ((1 - albedo) * openness / np.pi)[..., None]
     x = np.sqrt(np.maximum(facing[..., 0], 0.01))
     powers = np.stack([x**i * r**k for i in range(3) for k in range(3)], axis=-1)
-    numbers = powers @ np.reshape(COEFFICIENTS, (11, 9)).T
+    numbers = powers @ np.transpose(COEFFICIENTS)
     weights = np.exp(np.concatenate([numbers[..., 8:], np.zeros((*r.shape, 1))], axis=-1))
     weights /= weights.sum(-1, keepdims=True)
     reflected = sum(
