@@ -23,27 +23,27 @@ struct BeamRelight
     float3 seenNormal(float3 rawNormal_0, float3 view_1)
     {
         float size_0 = length(rawNormal_0);
-        float3 _S23;
-        if(size_0 > 9.999999960041972e-13f)
+        float3 _S22;
+        if(size_0 > 1e-12f)
         {
-            _S23 = rawNormal_0 / size_0;
+            _S22 = rawNormal_0 / size_0;
         }
         else
         {
-            _S23 = view_1;
+            _S22 = view_1;
         }
-        return _S23;
+        return _S22;
     }
 
     float specularAlbedo(float2 albedoTerms_0)
     {
-        return 0.03999999910593033f * albedoTerms_0.x + albedoTerms_0.y;
+        return 0.04f * albedoTerms_0.x + albedoTerms_0.y;
     }
 
     float3 lightNormal(Surface surface_5)
     {
         float3 normal_3 = seenNormal(surface_5.normal, surface_5.view);
-        float away_1 = 0.00100000004749745f - dot(normal_3, surface_5.view);
+        float away_1 = 0.001f - dot(normal_3, surface_5.view);
         float3 _S29;
         if(away_1 > 0.0f)
         {
@@ -64,7 +64,7 @@ struct BeamRelight
     float discCosine(LightDisc disc_1, float3 normal_4)
     {
         float middle_1 = dot(normal_4, disc_1.direction);
-        float width_1 = 0.86602538824081421f * disc_1.sine * sqrt(max(1.0f - middle_1 * middle_1, 0.0f));
+        float width_1 = 0.8660254f * disc_1.sine * sqrt(max(1.0f - middle_1 * middle_1, 0.0f));
         if((abs(middle_1)) < width_1)
         {
             float _S30 = middle_1 + width_1;
@@ -93,10 +93,10 @@ struct BeamRelight
         float3 middle_2 = normalize(view_2 + light_0);
         float nDotH_0 = dot(normal_5, middle_2);
         float a2_0 = alpha_1 * alpha_1;
-        float d_2 = nDotH_0 * nDotH_0 * (a2_0 - 1.0f) + 1.0f;
+        float d_1 = nDotH_0 * nDotH_0 * (a2_0 - 1.0f) + 1.0f;
         float _S32 = 1.0f - a2_0;
         float m_0 = clamp(1.0f - dot(view_2, middle_2), 0.0f, 1.0f);
-        return a2_0 / (3.14159274101257324f * d_2 * d_2) * (0.5f / max(nDotV_1 * sqrt(nDotL_0 * nDotL_0 * _S32 + a2_0) + nDotL_0 * sqrt(nDotV_1 * nDotV_1 * _S32 + a2_0), 9.999999960041972e-13f)) * (0.03999999910593033f + 0.95999997854232788f * m_0 * m_0 * m_0 * m_0 * m_0);
+        return a2_0 / (3.1415927f * d_1 * d_1) * (0.5f / max(nDotV_1 * sqrt(nDotL_0 * nDotL_0 * _S32 + a2_0) + nDotL_0 * sqrt(nDotV_1 * nDotV_1 * _S32 + a2_0), 1e-12f)) * (0.04f + 0.96f * m_0 * m_0 * m_0 * m_0 * m_0);
     }
 
     float3 lightRadiance(Surface surface_7, LightDisc disc_2, float2 albedoTerms_3)
@@ -104,8 +104,8 @@ struct BeamRelight
         float3 normal_6 = lightNormal(surface_7);
         float widening_0 = 0.5f * disc_2.sine;
         float _S33 = surface_7.roughness;
-        float _S34 = max(_S33 * _S33, 0.00100000004749745f);
-        return (surface_7.baseColor * ((1.0f - specularAlbedo(albedoTerms_3)) / 3.14159274101257324f * discCosine(disc_2, normal_6)) + specularBrdf(normal_6, surface_7.view, disc_2.direction, max(sqrt(_S34 * _S34 + widening_0 * widening_0), 0.00100000004749745f)) * max(dot(normal_6, disc_2.direction), 0.0f)) * disc_2.irradiance;
+        float _S34 = max(_S33 * _S33, 0.001f);
+        return (surface_7.baseColor * ((1.0f - specularAlbedo(albedoTerms_3)) / 3.1415927f * discCosine(disc_2, normal_6)) + specularBrdf(normal_6, surface_7.view, disc_2.direction, max(sqrt(_S34 * _S34 + widening_0 * widening_0), 0.001f)) * max(dot(normal_6, disc_2.direction), 0.0f)) * disc_2.irradiance;
     }
 };
 

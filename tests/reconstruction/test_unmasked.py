@@ -95,11 +95,11 @@ def test_exposures_and_white_balances_are_matched(device):
 
 def test_a_view_that_was_not_used(scene, device):
     held, used = scene[2], [known.view for i, known in enumerate(scene) if i != 2]
-    many = {"gaussian_count": 3000, "color_iterations": 40, "normal_iterations": 80}
+    many = {"gaussian_count": 4000, "color_iterations": 60, "normal_iterations": 100}
     asked = {name: value * PLENTY // len(used) for name, value in many.items()}
     fitting = FitOptions(samples=1, refine_every=60, **asked)
     track, report = FitAndTrack(fitting=fitting, device=device).begin(used, no_progress)
-    assert report["iterations"] == 120
+    assert report["iterations"] == 160
     drawn = rasterize(track.cloud, held.view.camera, channels=("radiance",), options=fitting.raster, device=device)
     color = np.clip(drawn.channels["radiance"] * drawn.alpha[..., None], 0.0, 1.0)
     off = linear_to_srgb(color) - linear_to_srgb(np.clip(held.view.color, 0.0, 1.0))
