@@ -7,9 +7,9 @@ albedo of the specular lobe E_s = F0 A(n·v, r) + B(n·v, r), F0 = 0.04, a pixel
 
 multiplied by its alpha, at a cost that no light changes. Directions d_k, roughnesses r_k and weights w_k are those of
 the round lobes that make up the one of (n·v, r), `beam_warp.kernels.light.stretched_lobe`. V is ambient occlusion (1
-is open) and S = clamp((n·v + V)^(2^(-16 r - 1)) - 1 + V, 0, 1) the specular occlusion that goes with it. The weight 1
-- E_s keeps energy: a white open surface under uniform light of radiance 1 shows 1 at every angle and roughness. This
-module makes E and L_r; ``kernels/light/shading.py`` evaluates the sum.
+is open) and S = clamp((n·v + V)^(2^(-16 r - 1)) - 1 + V, 0, 1) the specular occlusion that goes with it.
+The weight 1 - E_s keeps energy: a white open surface under uniform light of radiance 1 shows 1 at every angle and
+roughness. This module makes E and L_r; ``kernels/light/shading.py`` evaluates the sum.
 
 Sources: Karis 2013 (split sum); Lagarde and de Rousiers 2014 (specular occlusion, listing 26); Kulla and Conty 2017 and
 Blender's Principled BSDF (albedo scaling). Left out: self-reflection between surfaces.
