@@ -22,6 +22,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.errors import InvalidOptionError
 from beam_warp.image.files import write_exr, write_png
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import samples_of_images
 from beam_warp.render.channels import DRAWABLE, OBSERVABILITY, channel_range, see_channel
 from beam_warp.stage.output import IMAGE_SUFFIXES, FramePattern, Still, numbered, parse_target, require_folder
 from beam_warp.world.axes import change_axes
@@ -57,6 +58,10 @@ class DrawChannel:
     range: Annotated[
         tuple[float, float] | None,
         arg(metavar="LOW HIGH", help="Ends of the colour map; by default 0 and what most Gaussians are below."),
+    ] = None
+    samples: Annotated[
+        int | None,
+        arg(metavar="N", help="A pixel is the mean of N x N samples; by default as many as fits take, 2 at least."),
     ] = None
     frame: Annotated[int | None, arg(metavar="N", help="Only this frame, counted from 0; all by default.")] = None
     camera: OmitArgPrefixes[StillCameraFlags] = field(default_factory=StillCameraFlags)
@@ -147,19 +152,24 @@ def _numbered_views(args: DrawChannel, sequence: GaussianSequence) -> list[Plann
 
 
 class _ChannelDrawing:
-    """Draws one channel of the asset; all images have one range, that of the first."""
+    """Draws one channel of the asset; all images have one range and as many samples a pixel, those of the first."""
 
     def __init__(self, args: DrawChannel, options: RasterOptions) -> None:
         self._args = args
         self._options = options
         self._name = args.name
         self._range = args.range
+        self._samples = args.samples
         self._is_mapped = False
         self._shares: list[dict[str, float]] = []
 
     def draw(self, view: PlannedView, cloud: GaussianCloud) -> None:
         """Draw one image and write it."""
-        seen = see_channel(cloud, view.camera, self._name, options=self._options, device=self._args.device)
+        if self._samples is None:
+            self._samples = samples_of_images(cloud, [view.camera], self._options)
+        seen = see_channel(
+            cloud, view.camera, self._name, samples=self._samples, options=self._options, device=self._args.device
+        )
         self._is_mapped = seen.is_mapped
         if self._range is None:
             self._range = channel_range(cloud, self._name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from beam_warp.device.arrays import resolve_device
 from beam_warp.image.video import INSTALL, VideoOptions, find_ffmpeg
 from beam_warp.outputs import require_apart
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import samples_of_images
 from beam_warp.render.options import LAYERS, DeferredOptions
 from beam_warp.render.path import PathOptions
 from beam_warp.render.pictures import BLACK, PictureOptions, PictureWriter
@@ -30,13 +31,6 @@ from beam_warp.stage.renderers import DeferredFrames, PathFrames
 from beam_warp.stage.stage import Stage
 from beam_warp.study.targets import in_words, outcome
 from beam_warp.world.metadata import numbers_of_frames
-
-DEFAULT_SAMPLES = 2
-"""Side of the square of samples of a pixel where ``--samples`` is not given.
-
-Images of a capture, and truth, are averages over a pixel. One sample in its middle costs an asset up to 7 dB of base
-colour against them; 2 x 2 have most of that, and fits take up to 4 x 4 (docs/evaluation.md).
-"""
 
 
 @dataclass(frozen=True)
@@ -71,9 +65,12 @@ def render(args: Render) -> int:
     device, target, said = resolve_device(args.device), args.targets.target, None
     picture, notes = _picture(args)
     with progress(args.quiet or args.json) as report:
-        renderer = _renderer(args, stage)  # refuses what is out of range
         plan = _plan(args, stage, frame_count) if capture is None else _plan_of_capture(args, stage, capture)
         require_apart(plan.outputs, "out")
+        if args.mode != "path" and args.deferred.samples is None and target is None:
+            side = _samples(args, stage, plan)
+            args = replace(args, deferred=replace(args.deferred, samples=side))
+        renderer = _renderer(args, stage)  # refuses what is out of range
         writer, raster = PictureWriter(picture), _raster(args, stage)
         if target is None:
             tally = _carry_out(plan, RenderJob(stage, renderer, writer, report), overwrite=args.output.overwrite)
@@ -112,13 +109,23 @@ def _renderer(args: Render, stage: Stage) -> FrameRenderer:
         return PathFrames(PathOptions(**options), device=args.device)
     flags, aov = args.deferred, args.output.aov
     options = stated(
-        samples=DEFAULT_SAMPLES if flags.samples is None else flags.samples,
+        samples=flags.samples,
         bounces=args.bounces,
         environment_shadows=flags.environment_shadows,
         light_map_size=flags.shadow_resolution,
     )
     shading = DeferredOptions(layers=LAYERS if aov else (), **options)
     return DeferredFrames(shading, raster=_raster(args, stage), errors=aov, device=args.device)
+
+
+def _samples(args: Render, stage: Stage, plan: RenderPlan) -> int:
+    """Return how many samples a side a pixel has where nobody says: those of the stage's first moment, for all images.
+
+    So they are the same whichever frames are asked for, and a film can be filled in later.
+    """
+    first = replace(plan.requests[0], time=0.0).shot(stage)
+    cameras = [request.camera for request in plan.requests if request.camera is not None]
+    return samples_of_images(first.cloud, cameras or [first.camera], _raster(args, stage))
 
 
 def _picture(args: Render) -> tuple[PictureOptions, list[str]]:

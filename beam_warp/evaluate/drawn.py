@@ -13,12 +13,10 @@ from beam_warp.image.metrics import block_means
 from beam_warp.raster.channels import RADIANCE, UNIT_CHANNELS
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import LEAST_SAMPLES, mean_where_covered
 from beam_warp.reconstruction.scores import seen_radiance
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud
-
-SAMPLES = 2
-"""Side of the square of samples of a pixel: truth is filtered by a box over the pixel, and so are the samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +61,7 @@ def draw_materials(
     channels: Sequence[str] = MATERIAL_CHANNELS,
     radiance: bool = False,
     raster: RasterOptions | None = None,
-    samples: int = SAMPLES,
+    samples: int = LEAST_SAMPLES,
     device: str | None = None,
 ) -> DrawnMaterials:
     """Draw a cloud; see `beam_warp.raster.gbuffer.rasterize` for what it refuses.
@@ -79,19 +77,15 @@ def draw_materials(
     """
     names = (*channels, *((RADIANCE,) if radiance else ()))
     buffer = rasterize(cloud, camera.supersampled(samples), channels=names, options=raster, device=device)
-    alpha = block_means(buffer.alpha, samples)
-
-    def mean(layer: NDArray[np.float32], unit: bool = False) -> NDArray[np.float32]:
-        extra = (...,) + (None,) * (layer.ndim - 2)
-        sums = block_means(layer * buffer.alpha[extra], samples)
-        weight = np.linalg.norm(sums, axis=-1, keepdims=True) if unit else alpha[extra]
-        return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0.0)
-
+    alpha = buffer.alpha
     return DrawnMaterials(
         camera,
-        alpha,
-        mean(buffer.depth),
-        {name: mean(buffer.channels[name], name in UNIT_CHANNELS) for name in channels},
+        block_means(alpha, samples).astype(np.float32),
+        mean_where_covered(buffer.depth, alpha, samples),
+        {
+            name: mean_where_covered(buffer.channels[name], alpha, samples, unit=name in UNIT_CHANNELS)
+            for name in channels
+        },
         block_means(seen_radiance(buffer, cloud), samples).astype(np.float32) if radiance else None,
     )
 

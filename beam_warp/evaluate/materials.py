@@ -19,7 +19,6 @@ from beam_warp.capture.matching import match_frames, scored_frames
 from beam_warp.checks import require_choice, require_count
 from beam_warp.errors import InvalidOptionError
 from beam_warp.evaluate.compared import ComparedAsset
-from beam_warp.evaluate.drawn import SAMPLES
 from beam_warp.evaluate.perceptual import PerceptualMetrics
 from beam_warp.evaluate.relighters import RELIGHTERS, Relighter
 from beam_warp.evaluate.scores import MaterialScores, MaterialViewScores, Scales, as_triple
@@ -27,7 +26,7 @@ from beam_warp.evaluate.steadiness import TemporalScores, gaussian_deviation, su
 from beam_warp.evaluate.views import ScoredView, ViewScorer
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.resolution import samples_of_fit
+from beam_warp.raster.resolution import samples_of_images
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
 
@@ -52,7 +51,7 @@ class EvaluateOptions:
         split: Which records of the capture.
         raster: How splats are drawn; None draws them as the asset's metadata states.
         samples: Side of the square of samples of a pixel; None takes as many as the Gaussians need to look as they did
-            when they were fitted (`beam_warp.raster.resolution.samples_of_fit`), at least `SAMPLES`.
+            when they were fitted (`beam_warp.raster.resolution.samples_of_images`).
         relighters: Names in `beam_warp.evaluate.relighters.RELIGHTERS`.
         scaled_relighting: Also relight with base colour scaled, as is the custom where the capture's light is unknown.
         device: Warp device; None takes the first CUDA device, or the CPU where there is none.
@@ -120,7 +119,7 @@ def score_materials(
     samples = chosen.samples
     if samples is None:
         cameras = [record.camera for record in asset.records(shown[0])]
-        samples = max(samples_of_fit(asset.cloud(shown[0]), cameras, drawn), SAMPLES)
+        samples = samples_of_images(asset.cloud(shown[0]), cameras, drawn)
     scorer = ViewScorer(
         raster=drawn,
         samples=samples,

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from beam_warp.capture.capture import Capture, CaptureRecord
 from beam_warp.checks import require_count
 from beam_warp.evaluate.compared import ComparedAsset
-from beam_warp.evaluate.drawn import SAMPLES, DrawnMaterials, draw_materials, true_channel
+from beam_warp.evaluate.drawn import DrawnMaterials, draw_materials, true_channel
 from beam_warp.image.color import linear_to_srgb
 from beam_warp.jobs.listeners import CountProgress, no_progress
 from beam_warp.mesh.distances import SurfaceTree
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import LEAST_SAMPLES
 from beam_warp.reconstruction.scores import read_truth_mesh
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianSequence
@@ -209,7 +210,7 @@ def surface_scores(
     asset: ComparedAsset,
     *,
     raster: RasterOptions | None = None,
-    samples: int = SAMPLES,
+    samples: int = LEAST_SAMPLES,
     point_count: int = POINT_COUNT,
     device: str | None = None,
     progress: CountProgress = no_progress,

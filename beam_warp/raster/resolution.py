@@ -1,5 +1,6 @@
 """How finely Gaussians are to be sampled: by samples of a pixel where they are finer, by fewer pixels where coarser.
 
+Photographs and truth are means over a pixel, so a pixel is the mean of samples that are finer than the Gaussians.
 Images are reduced by a whole factor to where a pixel is half as wide as the splats' deviation, if they are finer than
 that.
 """
@@ -12,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from beam_warp.image.metrics import block_means
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -23,6 +25,14 @@ them."""
 
 MOST_SAMPLES = 4
 """Largest side of the square of samples of a pixel."""
+
+LEAST_SAMPLES = 2
+"""Side of the square of samples of a pixel of a still image, at least: one sample in the middle of a pixel costs up to
+7 dB of base colour against means over it (docs/evaluation.md)."""
+
+MOST_IMAGE_SAMPLES = 7680 * 4320
+"""Samples of a whole image, at most, unless `LEAST_SAMPLES` take more: 2 x 2 of an image of 3840 x 2160, 4 x 4 of
+1920 x 1080. Memory and time go with them."""
 
 SAMPLES_PER_SPACING = 2.0
 """Samples that fall on the distance of neighbouring Gaussians, unless `MOST_SAMPLES` are fewer."""
@@ -77,6 +87,39 @@ def samples_of_fit(cloud: GaussianCloud, cameras: Sequence[Camera], options: Ras
     if not options.antialiased or not len(cloud) or not cameras:
         return 1
     return sample_side(cameras, np.median(cloud.positions, axis=0), disc_spacing(cloud))
+
+
+def samples_of_images(cloud: GaussianCloud, cameras: Sequence[Camera], options: RasterOptions) -> int:
+    """Return how many samples a side a pixel of still images has, where nothing else is asked for.
+
+    As many as fits take (`samples_of_fit`), so that images are what the photographs were: at least `LEAST_SAMPLES`, and
+    no more than `MOST_IMAGE_SAMPLES` allow.
+    """
+    largest = max((camera.width * camera.height for camera in cameras), default=1)
+    allowed = int(np.sqrt(MOST_IMAGE_SAMPLES / largest))
+    return max(min(samples_of_fit(cloud, cameras, options), allowed), LEAST_SAMPLES)
+
+
+def mean_where_covered(
+    values: NDArray[np.float32], alpha: NDArray[np.float32], side: int, *, unit: bool = False
+) -> NDArray[np.float32]:
+    """Return the means over the samples of each pixel, weighted by coverage.
+
+    Args:
+        values: One for each sample, ``(H side, W side)`` or ``(H side, W side, C)``.
+        alpha: Coverage of each sample, ``(H side, W side)``.
+        side: Side of the square of samples of a pixel.
+        unit: Scale means to unit length.
+
+    Returns:
+        ``(H, W)`` or ``(H, W, C)``; 0 where nothing is covered.
+    """
+    if side == 1:
+        return values
+    weights = alpha[(...,) + (None,) * (values.ndim - 2)]
+    sums = block_means(values * weights, side)
+    weight = np.linalg.norm(sums, axis=-1, keepdims=True) if unit else block_means(weights, side)
+    return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0.0).astype(np.float32)
 
 
 def reduction_factor(cloud: GaussianCloud, cameras: Sequence[Camera], *, near: float) -> int:

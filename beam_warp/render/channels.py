@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
-from beam_warp.checks import require_choice
+from beam_warp.checks import require_choice, require_count
 from beam_warp.errors import InvalidArrayError
 from beam_warp.image.color import DISPLAY_SRGB
 from beam_warp.image.files import display_image
+from beam_warp.image.metrics import block_means
 from beam_warp.image.panels import BACKGROUND, over_background
 from beam_warp.raster.channels import CHANNELS, RADIANCE, UNIT_CHANNELS, channel_layers
 from beam_warp.raster.gbuffer import rasterize, rasterize_values
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import mean_where_covered
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, Observability
 
@@ -131,7 +133,13 @@ class SeenChannel:
 
 
 def see_channel(
-    cloud: GaussianCloud, camera: Camera, name: str, *, options: RasterOptions | None = None, device: str | None = None
+    cloud: GaussianCloud,
+    camera: Camera,
+    name: str,
+    *,
+    samples: int = 1,
+    options: RasterOptions | None = None,
+    device: str | None = None,
 ) -> SeenChannel:
     """Draw one channel of a cloud.
 
@@ -139,28 +147,32 @@ def see_channel(
         cloud: Gaussians, axes "rfu".
         camera: The view.
         name: One of `DRAWABLE`.
+        samples: Side of the square of samples of a pixel, of which it is the mean.
         options: How splats are drawn: as they were when the Gaussians were fitted.
         device: Warp device.
 
     Raises:
-        InvalidOptionError: There is no such channel, or the cloud is in other axes.
+        InvalidOptionError: There is no such channel, the samples are out of range, or the cloud is in other axes.
         InvalidArrayError: The cloud lacks the channel.
     """
     require_choice("channel", name, DRAWABLE)
+    fine = camera.supersampled(require_count("samples", samples, 1, 16))
     if name != OBSERVABILITY:
-        buffer = rasterize(cloud, camera, channels=(name,), options=options, device=device)
+        buffer = rasterize(cloud, fine, channels=(name,), options=options, device=device)
         is_display = name == RADIANCE and cloud.radiance_color_space == DISPLAY_SRGB
-        return SeenChannel(name, buffer.alpha, buffer.channels[name], is_display)
+        means = mean_where_covered(buffer.channels[name], buffer.alpha, samples, unit=name in UNIT_CHANNELS)
+        return SeenChannel(name, block_means(buffer.alpha, samples).astype(np.float32), means, is_display)
     if cloud.observability is None:
         raise InvalidArrayError(
             f"channel must be one that the cloud holds, got {name!r}, which it lacks "
             f"(it has {', '.join(cloud.arrays())}). Choose another."
         )
     flags = np.stack([(cloud.observability & np.uint8(flag)) != 0 for flag in FLAG_COLORS], axis=1)
-    seen = rasterize_values(cloud, camera, flags.astype(np.float32), options=options, device=device)
-    alpha = seen.alpha[..., None]
-    shares = np.divide(seen.values, alpha, out=np.zeros_like(seen.values), where=alpha > 0.0)
-    return SeenChannel(name, np.minimum(seen.alpha, np.float32(1.0)), shares)
+    seen = rasterize_values(cloud, fine, flags.astype(np.float32), options=options, device=device)
+    alpha = block_means(seen.alpha, samples).astype(np.float32)
+    values, weights = block_means(seen.values, samples).astype(np.float32), alpha[..., None]
+    shares = np.divide(values, weights, out=np.zeros_like(values), where=weights > 0.0)
+    return SeenChannel(name, np.minimum(alpha, np.float32(1.0)), shares)
 
 
 def channel_range(cloud: GaussianCloud, name: str) -> tuple[float, float]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from beam_warp.image.metrics import block_means
 from beam_warp.raster.channels import ERROR_CHANNELS
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import mean_where_covered
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import DeferredOptions
 from beam_warp.render.path import PathOptions, PathRenderer
@@ -42,18 +39,8 @@ class DeferredFrames:
             return image
         camera, side = shot.camera.supersampled(self._samples), self._samples
         drawn = rasterize(shot.cloud, camera, channels=names, options=self._raster, device=self._device)
-        layers = {name: _mean_where_covered(drawn.channels[name], drawn.alpha, side) for name in names}
+        layers = {name: mean_where_covered(drawn.channels[name], drawn.alpha, side) for name in names}
         return replace(image, layers={**image.layers, **layers})
-
-
-def _mean_where_covered(values: NDArray[np.float32], alpha: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Return the mean over the samples of each pixel, weighted by alpha; 0 where nothing is covered."""
-    if side == 1:
-        return values
-    weights = alpha[..., None]
-    total, weight = block_means(values.reshape(*alpha.shape, -1) * weights, side), block_means(weights, side)
-    mean = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.0).astype(np.float32)
-    return mean[..., 0] if values.ndim == 2 else mean
 
 
 class PathFrames:

@@ -16,6 +16,7 @@ from beam_warp.cli.drawing.flags import Render
 from beam_warp.cli.main import main
 from beam_warp.image.files import read_image, write_exr
 from beam_warp.image.video import find_ffmpeg
+from beam_warp.raster import resolution
 from beam_warp.world.gaussians import GaussianSequence
 from beam_warp.world.lights import PointLight
 from beam_warp.world.shot import RenderedImage
@@ -294,6 +295,18 @@ class TestRenderers:
         assert (options.environment_shadows, options.light_map_size, options.bounces) == (4, 256, 1)
         assert options.samples == 2
         assert (more["raster"].low_pass, more["errors"]) == (0.5, True)
+
+    def test_pixels_have_the_samples_of_the_fit_whichever_frame_is_asked_for(
+        self, common, recorder, tmp_path, monkeypatch
+    ):
+        start = points(0).positions[:, 0].mean() + 0.5  # only the first frame is fine
+        monkeypatch.setattr(
+            resolution, "disc_spacing", lambda cloud: 1e-3 if cloud.positions[:, 0].mean() < start else 1e3
+        )
+        assert run(*common, "--out", tmp_path / "x.png", "--frame", 2, "--antialiased", "yes") == 0
+        assert recorder.options[0][0].samples == resolution.MOST_SAMPLES
+        assert run(*common, "--out", tmp_path / "y.png", "--frame", 2, "--antialiased", "yes", "--samples", 3) == 0
+        assert recorder.options[1][0].samples == 3
 
     def test_what_is_behind(self, common_still, recorder, tmp_path):
         for name, more in (("a", []), ("b", ["--background", "environment"]), ("c", ["--background", 0, 0.5, 1])):

@@ -93,6 +93,24 @@ def test_values_are_those_of_the_g_buffer(device):
     assert np.array_equal(seen.alpha, buffer.alpha)
 
 
+@pytest.mark.parametrize("name", ["roughness", "normals", "radiance", "observability"])
+def test_a_pixel_is_the_mean_of_what_its_samples_cover(name):
+    """Float64, pixel by pixel: means are weighted by coverage, directions are of unit length."""
+    width, height, side = 12, 9, 3
+    fine = see_channel(ball(), camera(width * side, height * side), name, device="cpu")
+    seen = see_channel(ball(), camera(width, height), name, samples=side, device="cpu")
+    for row in range(height):
+        for column in range(width):
+            block = np.s_[row * side : (row + 1) * side, column * side : (column + 1) * side]
+            weights = fine.alpha[block].astype(np.float64)
+            assert seen.alpha[row, column] == pytest.approx(weights.mean(), abs=1e-6)
+            values = fine.values[block].astype(np.float64).reshape(side * side, -1)
+            expected = weights.reshape(-1) @ values / max(weights.sum(), 1e-12)
+            if name == "normals":
+                expected /= max(np.linalg.norm(expected), 1e-12)
+            np.testing.assert_allclose(np.ravel(seen.values[row, column]), expected, atol=2e-5)
+
+
 def test_colours_and_directions_are_shown_as_they_are():
     buffer = rasterize(ball(), camera(), channels=("base_color", "normals", "radiance"))
     alpha, found = buffer.alpha[..., None], buffer.channels
@@ -229,6 +247,8 @@ class TestFlags:
 def test_errors_name_the_contract():
     with pytest.raises(InvalidOptionError, match=r"channel must be one of radiance, .*observability, got 'albedo'"):
         see_channel(ball(), camera(), "albedo")
+    with pytest.raises(InvalidOptionError, match=r"samples must be an integer in \[1, 16\], got 0"):
+        see_channel(ball(), camera(), "roughness", samples=0)
     with pytest.raises(InvalidArrayError, match=r"got 'observability', which it lacks \(it has positions"):
         see_channel(ball(observability=None), camera(), "observability")
     with pytest.raises(InvalidArrayError, match=r"got 'roughness_error', which it lacks \(it has positions"):

@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from beam_warp.render.path import PathOptions
 from beam_warp.stage import renderers
 from beam_warp.stage.jobs import FrameContext
-from beam_warp.stage.renderers import PathFrames, _mean_where_covered
+from beam_warp.stage.renderers import PathFrames
 
 
 class MadeUpRenderer:
@@ -51,12 +50,3 @@ def test_every_frame_has_its_noise_and_always_the_same(path_frames):
 def test_what_decides_is_what_was_asked_for(path_frames):
     frames, _ = path_frames
     assert frames.decisive == ("path", PathOptions(samples=8, seed=2**32 - 1))
-
-
-def test_errors_are_means_over_the_samples_that_are_covered():
-    alpha = np.float32([[1.0, 0.5, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0]])
-    values = np.float32([[1.0, 3.0, 9.0, 9.0], [9.0, 5.0, 9.0, 9.0]])
-    np.testing.assert_allclose(_mean_where_covered(values, alpha, 2), [[2.5, 0.0]])
-    colors = np.stack([values, 2.0 * values], axis=-1)
-    np.testing.assert_allclose(_mean_where_covered(colors, alpha, 2), [[[2.5, 5.0], [0.0, 0.0]]])
-    assert _mean_where_covered(values, alpha, 1) is values

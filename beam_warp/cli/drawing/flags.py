@@ -141,8 +141,8 @@ class DeferredFlags:
         int | None,
         arg(
             metavar="N",
-            help="Deferred: a pixel is the mean of N x N samples, as photographs average over a pixel; 2 by default. "
-            "1 is faster and loses up to 7 dB of base colour.",
+            help="Deferred: a pixel is the mean of N x N samples, as photographs average over a pixel; by default "
+            "as many as the Gaussians were fitted with, 2 at least. 1 is faster and loses up to 7 dB of base colour.",
         ),
     ] = None
     environment_shadows: Annotated[
