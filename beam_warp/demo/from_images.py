@@ -21,6 +21,7 @@ from beam_warp.demo.truth import DemoTruth, relit_views, score_views
 from beam_warp.device.arrays import resolve_device
 from beam_warp.digests import code_digest
 from beam_warp.image.files import write_png
+from beam_warp.image.metrics import block_means
 from beam_warp.image.panels import Panel, display_color, lay_out, over_background
 from beam_warp.jobs.listeners import StageProgress
 from beam_warp.jobs.progress import StageTimer
@@ -29,7 +30,9 @@ from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
 from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS
 from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import samples_of_images
 from beam_warp.reconstruction.drift import tracking_drift
 from beam_warp.reconstruction.fit import FitOptions, LearningRates
 from beam_warp.reconstruction.job import Reconstruction, ReconstructOptions, reconstruct
@@ -37,14 +40,11 @@ from beam_warp.reconstruction.joint_tracking import JointOptions
 from beam_warp.reconstruction.scores import read_truth_mesh, score_frame, seen_radiance
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
-from beam_warp.render.deferred import DeferredRenderer
-from beam_warp.render.options import UNSHADOWED
 from beam_warp.render.sheet import Relighting, display_exposure
 from beam_warp.trace.mesh_paths import TracedMesh
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianSequence
-from beam_warp.world.shot import Renderer
 
 TRUTH_PATHS = 64
 CHAMFER_SAMPLES = 20_000
@@ -161,8 +161,7 @@ def demo_from_images(
     figure = demo_figure_for(options.size).at(last / (FRAMES_PER_SECOND * DANCE_SECONDS))
     traced = TracedMesh.from_mesh(figure, device=device)
     truths = [DemoTruth.of(traced, camera, lights, TRUTH_PATHS) for camera in cameras]
-    renderer = DeferredRenderer(UNSHADOWED, raster=steps.raster, device=device)
-    relit = relit_views(result.sequence[last], cameras, lights, renderer, raster=steps.raster, device=device)
+    relit = relit_views(result.sequence[last], cameras, lights, raster=steps.raster, device=device)
     report: dict[str, Any] = {
         "options": asdict(options),
         "gaussians": [len(cloud) for cloud in found.sequence],
@@ -172,7 +171,7 @@ def demo_from_images(
         "warnings": [*found.report["warnings"], *result.report["warnings"]],
     }
     picture = out / "reconstruction.png"
-    _write_picture(picture, capture, found.sequence, result.sequence, meshes, lights, renderer, steps.raster, device)
+    _write_picture(picture, capture, found.sequence, result.sequence, meshes, lights, steps.raster, device)
     report["seconds"] = {**timer.seconds, "score relightings": time.perf_counter() - started}
     return FromImages(picture, result, report)
 
@@ -294,7 +293,6 @@ def _write_picture(
     relightable: GaussianSequence,
     meshes: Sequence[trimesh.Trimesh],
     lights: Mapping[str, EnvironmentMap],
-    renderer: Renderer,
     raster: RasterOptions,
     device: str | None,
 ) -> None:
@@ -312,18 +310,22 @@ def _write_picture(
     for index, record in enumerate(records):
         cloud, camera = sequence[index], record.camera
         image = record.image().linear_rgba()
-        buffer = rasterize(cloud, camera, channels=(RADIANCE, SURFACE_NORMALS), options=raster, device=device)
-        alpha = buffer.alpha[..., None]
-        seen = display_color(seen_radiance(buffer, cloud), buffer.alpha)
-        (relit,) = relit_views(relightable[index], [camera], others, renderer, raster=raster, device=device)
+        side = samples_of_images(cloud, [camera], raster)
+        samples = rasterize(
+            cloud, camera.supersampled(side), channels=(RADIANCE, SURFACE_NORMALS), options=raster, device=device
+        )
+        drawn = PixelMeans.of(samples, side)
+        alpha = drawn.alpha[..., None]
+        seen = display_color(block_means(seen_radiance(samples, cloud), side), drawn.alpha)
+        (relit,) = relit_views(relightable[index], [camera], others, raster=raster, device=device)
         photograph = over_background(display_color(image[..., :3], image[..., 3]), image[..., 3:])
         show(f"frame {record.frame}: photograph", photograph)
         show("Gaussians", over_background(seen, alpha))
-        show("normals", over_background(0.5 * buffer.channels[SURFACE_NORMALS] + 0.5, alpha))
+        show("normals", over_background(0.5 * drawn.channels[SURFACE_NORMALS] + 0.5, alpha))
         show("mesh", shaded_image(meshes[index], camera.supersampled(factor), device), factor)
         for name, light in others.items():
-            lit = display_color(relit.radiance[name], relit.buffer.alpha, display_exposure(light))
-            show(f"relit: {name}", over_background(lit, relit.buffer.alpha[..., None]))
+            lit = display_color(relit.radiance[name], relit.seen.alpha, display_exposure(light))
+            show(f"relit: {name}", over_background(lit, relit.seen.alpha[..., None]))
     write_png(path, lay_out(panels, len(panels) // len(records)))
 
 

@@ -19,8 +19,6 @@ from beam_warp.image.files import write_exr, write_png
 from beam_warp.jobs.listeners import StageProgress, no_progress
 from beam_warp.jobs.report import write_report
 from beam_warp.raster.records import RasterOptions
-from beam_warp.render.deferred import DeferredRenderer
-from beam_warp.render.options import UNSHADOWED
 from beam_warp.render.sheet import Relighting
 from beam_warp.trace.mesh_paths import TracedMesh
 from beam_warp.world.camera import Camera
@@ -135,12 +133,10 @@ def run_demo(out: Path, options: DemoOptions | None = None, progress: StageProgr
     folder.mkdir(exist_ok=True)
     for name, light in scene.lights.items():
         write_exr(folder / f"{name}.exr", {c: light.radiance[..., i] for i, c in enumerate("RGB")})
-    renderer = DeferredRenderer(UNSHADOWED, raster=RASTER, device=options.device)
     relit = relit_views(
         result.sequence[scene.truth_frame],
         [truth.camera for truth in scene.truth],
         scene.lights,
-        renderer,
         raster=RASTER,
         device=options.device,
     )

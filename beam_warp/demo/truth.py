@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from beam_warp.image.files import display_image
 from beam_warp.image.metrics import SOLID_ALPHA, Score, compare, least_squares_scale, mean_scores
 from beam_warp.image.panels import Panel, display_color, gray, lay_out, over_background
-from beam_warp.raster.gbuffer import GBuffer, rasterize
+from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import samples_of_images
+from beam_warp.render.deferred import DeferredRenderer
+from beam_warp.render.options import UNSHADOWED
 from beam_warp.render.sheet import display_exposure
 from beam_warp.trace.mesh_paths import TracedChannels, TracedMesh, trace_channels, trace_radiance
 from beam_warp.world.camera import Camera
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
-from beam_warp.world.shot import Renderer, Shot
+from beam_warp.world.shot import Shot
 
 CHANNEL_SAMPLES = 16
 
@@ -46,7 +50,7 @@ class DemoTruth:
 class Relit:
     """What the Gaussians show in a view: channels and coverage, and radiance by light."""
 
-    buffer: GBuffer
+    seen: PixelMeans
     radiance: Mapping[str, NDArray[np.float32]]
 
 
@@ -54,22 +58,20 @@ def relit_views(
     cloud: GaussianCloud,
     cameras: Sequence[Camera],
     lights: Mapping[str, EnvironmentMap],
-    renderer: Renderer,
     *,
     raster: RasterOptions,
     device: str | None = None,
 ) -> list[Relit]:
-    """Draw a relightable cloud for some cameras: its channels, and what a renderer shows of it under each light."""
-    return [
-        Relit(
-            buffer,
-            {
-                name: renderer.draw(Shot(cloud=cloud, camera=buffer.camera, environment=light)).rgb
-                for name, light in lights.items()
-            },
-        )
-        for buffer in rasterize(cloud, cameras, options=raster, device=device)
-    ]
+    """Draw a relightable cloud for some cameras: its channels, and what deferred shading shows under each light."""
+    side = samples_of_images(cloud, cameras, raster)
+    renderer = DeferredRenderer(replace(UNSHADOWED, samples=side), raster=raster, device=device)
+    views = []
+    for camera in cameras:
+        samples = rasterize(cloud, camera.supersampled(side), options=raster, device=device)
+        shots = {name: Shot(cloud=cloud, camera=camera, environment=light) for name, light in lights.items()}
+        radiance = {name: renderer.draw(shot).rgb for name, shot in shots.items()}
+        views.append(Relit(PixelMeans.of(samples, side), radiance))
+    return views
 
 
 def score_views(truths: Sequence[DemoTruth], views: Sequence[Relit]) -> dict[str, Any]:
@@ -77,8 +79,8 @@ def score_views(truths: Sequence[DemoTruth], views: Sequence[Relit]) -> dict[str
     scores: dict[str, list[Score]] = {}
     scales, normals = [], []
     for truth, view in zip(truths, views, strict=True):
-        found = view.buffer.channels
-        both: dict[str, Any] = {"alpha": view.buffer.alpha, "truth_alpha": truth.alpha}
+        found = view.seen.channels
+        both: dict[str, Any] = {"alpha": view.seen.alpha, "truth_alpha": truth.alpha}
         for name, is_color in (("ambient_occlusion", False), ("base_color", True)):
             scores.setdefault(name, []).append(
                 compare(found[name], getattr(truth.channels, name), is_color=is_color, premultiplied=False, **both)
@@ -100,16 +102,16 @@ def score_views(truths: Sequence[DemoTruth], views: Sequence[Relit]) -> dict[str
 
 def comparison(truth: DemoTruth, view: Relit, lights: Mapping[str, EnvironmentMap]) -> NDArray[np.uint8]:
     """Draw ours above, truth below, for ambient occlusion, base colour and every light; 8-bit sRGB."""
-    found, known = view.buffer.channels, truth.channels
+    found, known = view.seen.channels, truth.channels
     pairs = [
         ("ambient occlusion", gray(found["ambient_occlusion"]), gray(known.ambient_occlusion)),
         ("base colour", display_image(found["base_color"]) / 255.0, display_image(known.base_color) / 255.0),
     ]
     for name, light in lights.items():
         stops = display_exposure(light)
-        ours = display_color(view.radiance[name], view.buffer.alpha, stops)
+        ours = display_color(view.radiance[name], view.seen.alpha, stops)
         pairs.append((name, ours, display_color(truth.radiance[name], truth.alpha, stops)))
-    alphas = view.buffer.alpha[..., None], truth.alpha[..., None]
+    alphas = view.seen.alpha[..., None], truth.alpha[..., None]
     above: list[Panel] = [(f"{title}, ours", over_background(a, alphas[0])) for title, a, _ in pairs]
     below: list[Panel] = [(f"{title}, truth", over_background(b, alphas[1])) for title, _, b in pairs]
     return lay_out([*above, *below], len(pairs))

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from beam_warp.image.files import Image
 from beam_warp.image.metrics import block_means
-from beam_warp.raster.channels import RADIANCE, UNIT_CHANNELS
+from beam_warp.raster.channels import RADIANCE
 from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.resolution import LEAST_SAMPLES, mean_where_covered
+from beam_warp.raster.resolution import LEAST_SAMPLES
 from beam_warp.reconstruction.scores import seen_radiance
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud
@@ -77,15 +78,12 @@ def draw_materials(
     """
     names = (*channels, *((RADIANCE,) if radiance else ()))
     buffer = rasterize(cloud, camera.supersampled(samples), channels=names, options=raster, device=device)
-    alpha = buffer.alpha
+    seen = PixelMeans.of(buffer, samples)
     return DrawnMaterials(
         camera,
-        block_means(alpha, samples).astype(np.float32),
-        mean_where_covered(buffer.depth, alpha, samples),
-        {
-            name: mean_where_covered(buffer.channels[name], alpha, samples, unit=name in UNIT_CHANNELS)
-            for name in channels
-        },
+        seen.alpha,
+        seen.depth,
+        {name: seen.channels[name] for name in channels},
         block_means(seen_radiance(buffer, cloud), samples).astype(np.float32) if radiance else None,
     )
 

@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from beam_warp.image.metrics import block_means
 from beam_warp.raster.records import RasterOptions
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import GaussianCloud
@@ -98,28 +97,6 @@ def samples_of_images(cloud: GaussianCloud, cameras: Sequence[Camera], options: 
     largest = max((camera.width * camera.height for camera in cameras), default=1)
     allowed = int(np.sqrt(MOST_IMAGE_SAMPLES / largest))
     return max(min(samples_of_fit(cloud, cameras, options), allowed), LEAST_SAMPLES)
-
-
-def mean_where_covered(
-    values: NDArray[np.float32], alpha: NDArray[np.float32], side: int, *, unit: bool = False
-) -> NDArray[np.float32]:
-    """Return the means over the samples of each pixel, weighted by coverage.
-
-    Args:
-        values: One for each sample, ``(H side, W side)`` or ``(H side, W side, C)``.
-        alpha: Coverage of each sample, ``(H side, W side)``.
-        side: Side of the square of samples of a pixel.
-        unit: Scale means to unit length.
-
-    Returns:
-        ``(H, W)`` or ``(H, W, C)``; 0 where nothing is covered.
-    """
-    if side == 1:
-        return values
-    weights = alpha[(...,) + (None,) * (values.ndim - 2)]
-    sums = block_means(values * weights, side)
-    weight = np.linalg.norm(sums, axis=-1, keepdims=True) if unit else block_means(weights, side)
-    return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0.0).astype(np.float32)
 
 
 def reduction_factor(cloud: GaussianCloud, cameras: Sequence[Camera], *, near: float) -> int:

@@ -18,8 +18,8 @@ from beam_warp.image.metrics import block_means
 from beam_warp.image.panels import BACKGROUND, over_background
 from beam_warp.raster.channels import CHANNELS, RADIANCE, UNIT_CHANNELS, channel_layers
 from beam_warp.raster.gbuffer import rasterize, rasterize_values
+from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.resolution import mean_where_covered
 from beam_warp.world.camera import Camera
 from beam_warp.world.gaussians import ATTRIBUTES, GaussianCloud, Observability
 
@@ -160,8 +160,8 @@ def see_channel(
     if name != OBSERVABILITY:
         buffer = rasterize(cloud, fine, channels=(name,), options=options, device=device)
         is_display = name == RADIANCE and cloud.radiance_color_space == DISPLAY_SRGB
-        means = mean_where_covered(buffer.channels[name], buffer.alpha, samples, unit=name in UNIT_CHANNELS)
-        return SeenChannel(name, block_means(buffer.alpha, samples).astype(np.float32), means, is_display)
+        means = PixelMeans.of(buffer, samples)
+        return SeenChannel(name, means.alpha, means.channels[name], is_display)
     if cloud.observability is None:
         raise InvalidArrayError(
             f"channel must be one that the cloud holds, got {name!r}, which it lacks "

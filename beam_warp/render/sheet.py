@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,9 @@ from beam_warp.image.files import display_image
 from beam_warp.image.panels import MARGIN, TITLE_HEIGHT, Panel, display_color, gray, lay_out, over_background
 from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
+from beam_warp.raster.resolution import samples_of_images
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import UNSHADOWED
 from beam_warp.world.camera import Camera
@@ -61,6 +63,8 @@ def contact_sheet(
 ) -> NDArray[np.uint8]:
     """Draw the captured colour, ambient occlusion, base colour, roughness, normals, and the relightings.
 
+    Pixels have the samples of `beam_warp.raster.resolution.samples_of_images`.
+
     Args:
         cloud: Relightable, with captured radiance, axes "rfu".
         camera: Sees each panel.
@@ -71,27 +75,29 @@ def contact_sheet(
     Returns:
         8-bit sRGB, ``(H, W, 3)``.
     """
-    names = ("base_color", "roughness", "ambient_occlusion", "normals")
-    buffer = rasterize(cloud, camera, channels=("radiance", *names), options=options, device=device)
-    alpha = buffer.alpha[..., None]
-    captured = buffer.channels["radiance"]
+    names = ("radiance", "base_color", "roughness", "ambient_occlusion", "normals")
+    side = samples_of_images(cloud, [camera], options or RasterOptions())
+    samples = rasterize(cloud, camera.supersampled(side), channels=names, options=options, device=device)
+    seen = PixelMeans.of(samples, side)
+    captured, base_color, roughness, occlusion, normals = (seen.channels[name] for name in names)
+    alpha = seen.alpha[..., None]
     if cloud.radiance_color_space != DISPLAY_SRGB:
         captured = display_image(captured) / 255.0
     panels = [
         ("captured", over_background(np.clip(captured, 0.0, 1.0), alpha)),
-        ("ambient occlusion (white is open)", over_background(gray(buffer.channels["ambient_occlusion"]), alpha)),
-        ("base colour", over_background(display_image(buffer.channels["base_color"]) / 255.0, alpha)),
-        ("roughness (white is 1)", over_background(gray(buffer.channels["roughness"]), alpha)),
-        ("normals (x, y, z as r, g, b)", over_background(0.5 * buffer.channels["normals"] + 0.5, alpha)),
+        ("ambient occlusion (white is open)", over_background(gray(occlusion), alpha)),
+        ("base colour", over_background(display_image(base_color) / 255.0, alpha)),
+        ("roughness (white is 1)", over_background(gray(roughness), alpha)),
+        ("normals (x, y, z as r, g, b)", over_background(0.5 * normals + 0.5, alpha)),
     ]
     prepared = [relighting.light for relighting in relightings if isinstance(relighting.light, PreparedEnvironment)]
-    renderer = DeferredRenderer(UNSHADOWED, raster=options, device=device, prepared=prepared)
+    renderer = DeferredRenderer(replace(UNSHADOWED, samples=side), raster=options, device=device, prepared=prepared)
     for relighting in relightings:
         light = relighting.environment
         image = renderer.draw(
             Shot(cloud=cloud, camera=camera, environment=light, environment_rotation=relighting.degrees)
         )
-        shown = display_color(image.rgb, buffer.alpha, display_exposure(light))
+        shown = display_color(image.rgb, seen.alpha, display_exposure(light))
         panels.append((relighting.title, over_background(shown, alpha)))
     return _grid(panels)
 

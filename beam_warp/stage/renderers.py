@@ -7,8 +7,8 @@ from typing import Any
 
 from beam_warp.raster.channels import ERROR_CHANNELS
 from beam_warp.raster.gbuffer import rasterize
+from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
-from beam_warp.raster.resolution import mean_where_covered
 from beam_warp.render.deferred import DeferredRenderer
 from beam_warp.render.options import DeferredOptions
 from beam_warp.render.path import PathOptions, PathRenderer
@@ -37,10 +37,9 @@ class DeferredFrames:
         names = [name for name in ERROR_CHANNELS if self._errors and getattr(shot.cloud, name) is not None]
         if not names or not len(shot.cloud):
             return image
-        camera, side = shot.camera.supersampled(self._samples), self._samples
+        camera = shot.camera.supersampled(self._samples)
         drawn = rasterize(shot.cloud, camera, channels=names, options=self._raster, device=self._device)
-        layers = {name: mean_where_covered(drawn.channels[name], drawn.alpha, side) for name in names}
-        return replace(image, layers={**image.layers, **layers})
+        return replace(image, layers={**image.layers, **PixelMeans.of(drawn, self._samples).channels})
 
 
 class PathFrames:

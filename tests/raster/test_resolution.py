@@ -11,7 +11,6 @@ from beam_warp.raster.resolution import (
     MOST_IMAGE_SAMPLES,
     MOST_SAMPLES,
     disc_spacing,
-    mean_where_covered,
     sample_side,
     samples_of_fit,
     samples_of_images,
@@ -61,17 +60,6 @@ def test_still_images_have_the_samples_of_the_fit_two_at_least_and_no_more_than_
         found = samples_of_images(ball_of_discs(0.1 / factor), [large], options)
         assert found == side
         assert found == LEAST_SAMPLES or large.width * large.height * found**2 <= MOST_IMAGE_SAMPLES
-
-
-def test_means_are_over_the_samples_that_are_covered():
-    alpha = np.float32([[1.0, 0.5, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0]])
-    values = np.float32([[1.0, 3.0, 9.0, 9.0], [9.0, 5.0, 9.0, 9.0]])
-    np.testing.assert_allclose(mean_where_covered(values, alpha, 2), [[2.5, 0.0]])
-    colors = np.stack([values, 2.0 * values], axis=-1)
-    np.testing.assert_allclose(mean_where_covered(colors, alpha, 2), [[[2.5, 5.0], [0.0, 0.0]]])
-    unit = mean_where_covered(colors, alpha, 2, unit=True)
-    np.testing.assert_allclose(unit, [[[0.2**0.5, 0.8**0.5], [0.0, 0.0]]], rtol=1e-6)
-    assert mean_where_covered(values, alpha, 1) is values
 
 
 def test_nothing_to_draw_takes_one_sample():
