@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beam_warp.image.files import Image
 from beam_warp.image.metrics import block_means
-from beam_warp.raster.channels import RADIANCE
+from beam_warp.raster.channels import RADIANCE, channel_layers
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
@@ -45,11 +45,7 @@ class DrawnMaterials:
         """Return the layers of an image file, named as in a capture's truth; R, G and B are the radiance, if any."""
         layers = {"A": self.alpha, "depth": self.depth}
         for name, array in self.channels.items():
-            prefix, parts = ("normal", "XYZ") if name == "normals" else (name, "RGB")
-            if array.ndim == 2:
-                layers[prefix] = array
-            else:
-                layers.update({f"{prefix}.{part}": array[..., i] for i, part in enumerate(parts)})
+            layers.update(channel_layers(name, array))
         if self.radiance is not None:
             layers.update({part: self.radiance[..., i] for i, part in enumerate("RGB")})
         return layers
