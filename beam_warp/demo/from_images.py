@@ -26,6 +26,7 @@ from beam_warp.image.panels import Panel, display_color, lay_out, over_backgroun
 from beam_warp.jobs.listeners import StageProgress
 from beam_warp.jobs.progress import StageTimer
 from beam_warp.jobs.report import write_json
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.mesh.extract import mesh_of_gaussians
 from beam_warp.mesh.preview import shaded_image
 from beam_warp.raster.channels import RADIANCE, SURFACE_NORMALS
@@ -161,7 +162,8 @@ def demo_from_images(
     figure = demo_figure_for(options.size).at(last / (FRAMES_PER_SECOND * DANCE_SECONDS))
     traced = TracedMesh.from_mesh(figure, device=device)
     truths = [DemoTruth.of(traced, camera, lights, TRUTH_PATHS) for camera in cameras]
-    relit = relit_views(result.sequence[last], cameras, lights, raster=steps.raster, device=device)
+    prepared = [PreparedEnvironment(light, device) for light in lights.values()]
+    relit = relit_views(result.sequence[last], cameras, lights, raster=steps.raster, device=device, prepared=prepared)
     report: dict[str, Any] = {
         "options": asdict(options),
         "gaussians": [len(cloud) for cloud in found.sequence],
@@ -171,7 +173,7 @@ def demo_from_images(
         "warnings": [*found.report["warnings"], *result.report["warnings"]],
     }
     picture = out / "reconstruction.png"
-    _write_picture(picture, capture, found.sequence, result.sequence, meshes, lights, steps.raster, device)
+    _write_picture(picture, capture, found.sequence, result.sequence, meshes, lights, prepared, steps.raster, device)
     report["seconds"] = {**timer.seconds, "score relightings": time.perf_counter() - started}
     return FromImages(picture, result, report)
 
@@ -293,6 +295,7 @@ def _write_picture(
     relightable: GaussianSequence,
     meshes: Sequence[trimesh.Trimesh],
     lights: Mapping[str, EnvironmentMap],
+    prepared: Sequence[PreparedEnvironment],
     raster: RasterOptions,
     device: str | None,
 ) -> None:
@@ -317,7 +320,7 @@ def _write_picture(
         drawn = PixelMeans.of(samples, side)
         alpha = drawn.alpha[..., None]
         seen = display_color(block_means(seen_radiance(samples, cloud), side), drawn.alpha)
-        (relit,) = relit_views(relightable[index], [camera], others, raster=raster, device=device)
+        (relit,) = relit_views(relightable[index], [camera], others, raster=raster, device=device, prepared=prepared)
         photograph = over_background(display_color(image[..., :3], image[..., 3]), image[..., 3:])
         show(f"frame {record.frame}: photograph", photograph)
         show("Gaussians", over_background(seen, alpha))

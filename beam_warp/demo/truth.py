@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beam_warp.image.files import display_image
 from beam_warp.image.metrics import SOLID_ALPHA, Score, compare, least_squares_scale, mean_scores
 from beam_warp.image.panels import Panel, display_color, gray, lay_out, over_background
+from beam_warp.light.prepared import PreparedEnvironment
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
@@ -61,10 +62,15 @@ def relit_views(
     *,
     raster: RasterOptions,
     device: str | None = None,
+    prepared: Sequence[PreparedEnvironment] = (),
 ) -> list[Relit]:
-    """Draw a relightable cloud for some cameras: its channels, and what deferred shading shows under each light."""
+    """Draw a relightable cloud for some cameras: its channels, and what deferred shading shows under each light.
+
+    Lights of ``prepared`` are not prepared again.
+    """
     side = samples_of_images(cloud, cameras, raster)
-    renderer = DeferredRenderer(replace(UNSHADOWED, samples=side), raster=raster, device=device)
+    options = replace(UNSHADOWED, samples=side)
+    renderer = DeferredRenderer(options, raster=raster, device=device, prepared=prepared)
     views = []
     for camera in cameras:
         samples = rasterize(cloud, camera.supersampled(side), options=raster, device=device)
