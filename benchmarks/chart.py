@@ -19,7 +19,7 @@ from beam_warp.world.shapes import still_life
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device=None)
+    parser = record.parser(__doc__, device=True)
     parser.add_argument("--budget-seconds", type=float, default=30.0, help="of measuring, after the references")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)

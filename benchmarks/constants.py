@@ -486,7 +486,7 @@ def measure(
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device=None, data=True, quick="the demo's capture and a handful of constants")
+    parser = record.parser(__doc__, device=True, data=True, quick="the demo's capture and a handful of constants")
     parser.add_argument("--workers", type=int, default=6, help="processes that share the device")
     parser.add_argument("--seconds", type=float, help="begin no row after so long")
     parser.add_argument("--only", nargs="+", choices=list(GROUPS), default=[], metavar="GROUP")

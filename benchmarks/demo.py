@@ -18,7 +18,7 @@ from beam_warp.device.arrays import resolve_device
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device=None)
+    parser = record.parser(__doc__, device=True)
     parser.add_argument("--folder", type=Path, required=True, help="where the demo writes")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)

@@ -326,7 +326,7 @@ PARTS = ("light", "occlusion", "bounce", "pilot")
 
 def main() -> None:
     """Measure every subject and write what came out."""
-    parser = record.parser(__doc__, device="cpu", data=True)
+    parser = record.parser(__doc__, device=True, data=True)
     parser.add_argument("--captures", nargs="+", default=CAPTURES, choices=CAPTURES)
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--reference-rays", type=int, default=1024)

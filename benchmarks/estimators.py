@@ -248,7 +248,7 @@ def measure_sky(
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device=None)
+    parser = record.parser(__doc__, device=True)
     parser.add_argument("--scene", choices=("ball", "figure"), default="ball")
     parser.add_argument("--points", type=int, default=192)
     arguments = parser.parse_args()

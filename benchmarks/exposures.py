@@ -61,7 +61,7 @@ def measure(views: Sequence[CapturedView], device: str) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", data=True)
+    parser = record.parser(__doc__, device=True, data=True)
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], metavar="NAME")
     parser.add_argument("--cameras", nargs="+", type=int, default=[4, 6, 8, 12, 24], metavar="N")
     arguments = parser.parse_args()

@@ -92,7 +92,7 @@ def measure_rays(path: Path, samples: int, device: Any, points: int) -> dict[str
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device=None)
+    parser = record.parser(__doc__, device=True)
     parser.add_argument("input", type=Path)
     parser.add_argument("--environment", type=Path, required=True)
     parser.add_argument("--samples", type=int, default=64)

@@ -414,7 +414,7 @@ def known_rows(arguments: argparse.Namespace) -> list[Row]:
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", data=True)
+    parser = record.parser(__doc__, device=True, data=True)
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], metavar="NAME", help="or demo")
     parser.add_argument("--flaws", nargs="+", default=[CLEAN, TOGETHER, *FLAWS], metavar="NAME")
     parser.add_argument("--sizes", nargs="+", type=float, default=[1.0], metavar="S", help="over the nominal size")

@@ -285,7 +285,7 @@ class Budget:
 
 def main() -> None:
     """Account for every capture and write what came out."""
-    parser = record.parser(__doc__, device=None, data=True)
+    parser = record.parser(__doc__, device=True, data=True)
     parser.add_argument("--assets", type=Path, required=True, metavar="FOLDER", help="what beam run made of captures")
     parser.add_argument("--captures", nargs="+", default=CAPTURES, choices=CAPTURES)
     parser.add_argument("--rays", type=int, default=RAYS, help="rays of a pixel")

@@ -196,7 +196,7 @@ PARTS = {"processes": processes, "cluster": cluster}
 
 def main() -> None:
     """Kill, and write the result after every take."""
-    parser = record.parser(__doc__, device="cpu", quick="four kills, to see whether it runs", parts=PARTS)
+    parser = record.parser(__doc__, device=True, quick="four kills, to see whether it runs", parts=PARTS)
     parser.add_argument("--kills", type=int, default=100, help="at least, in each part")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", choices=TAKES, default="toy", help="steps that nap, or all of beam run, small")

@@ -167,7 +167,7 @@ def summary(cases: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main() -> None:
     """Run the sweep and write what came out."""
-    parser = record.parser(__doc__, device="cpu", data=True)
+    parser = record.parser(__doc__, device=True, data=True)
     parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=SUBJECTS)
     given = parser.parse_args()
     device = str(resolve_device(given.device))

@@ -109,7 +109,7 @@ def highlight_scales(evidence: LightEvidence, light: EnvironmentMap) -> dict[str
 
 def main() -> None:
     """Ask every capture and write what came out."""
-    parser = record.parser(__doc__, device="cpu", data=True)
+    parser = record.parser(__doc__, device=True, data=True)
     given = parser.parse_args()
     device = resolve_device(given.device)
     rows: dict[str, Any] = {}

@@ -105,7 +105,7 @@ PARTS: dict[str, Callable[[Bench], Iterator[Row]]] = {
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", data=True, quick="the demo's capture, small", parts=PARTS)
+    parser = record.parser(__doc__, device=True, data=True, quick="the demo's capture, small", parts=PARTS)
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], help="names there")
     parser.add_argument("--assets", type=Path, metavar="DIR", help="reconstructions, NAME/gaussians.usda")
     parser.add_argument("--gaussians", type=int, default=140_000, help="of reconstructions that are made here")

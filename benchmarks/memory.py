@@ -119,7 +119,7 @@ def long_capture(folder: Path, frames: int, side: int, cameras: int, device: str
 
 def main() -> None:
     """Measure, and write the result every few frames."""
-    parser = record.parser(__doc__, device=None, quick="100 frames, to see whether it runs")
+    parser = record.parser(__doc__, device=True, quick="100 frames, to see whether it runs")
     parser.add_argument("--tiny", action="store_true", help="images and models as small as they can be, for a CPU")
     parser.add_argument("--frames", type=int, default=1000)
     arguments = parser.parse_args()

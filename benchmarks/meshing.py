@@ -179,7 +179,7 @@ def compare(
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device=None, quick="small images and one repeat")
+    parser = record.parser(__doc__, device=True, quick="small images and one repeat")
     parser.add_argument("--side", type=int, default=256, metavar="PX", help="of the depth images")
     parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()

@@ -541,7 +541,7 @@ def sections(effort: Effort, device: Any) -> dict[str, Callable[[Any], Iterator[
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", quick="small scenes and few repeats: does all of it run?")
+    parser = record.parser(__doc__, device=True, quick="small scenes and few repeats: does all of it run?")
     parser.add_argument("--only", nargs="+", default=(), metavar="SECTION", help="measure these sections only")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)

@@ -100,7 +100,7 @@ def report(device: Any) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Measure and write."""
-    parser = record.parser(__doc__, device=None)
+    parser = record.parser(__doc__, device=True)
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     rows = report(device)

@@ -482,7 +482,7 @@ SECTIONS: dict[str, Callable[[Bench], Iterator[Row]]] = {
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", data=True, quick="the demo's capture, small")
+    parser = record.parser(__doc__, device=True, data=True, quick="the demo's capture, small")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write the sequences of captures there")
     parser.add_argument(
         "--only", nargs="+", default=(), choices=SECTIONS, metavar="SECTION", help="these sections only"

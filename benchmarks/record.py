@@ -25,6 +25,7 @@ from typing import Any
 
 from timing import machine
 
+from beam_warp.device.arrays import resolve_device
 from beam_warp.jobs.report import versions
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -53,13 +54,13 @@ DIGITS = 8
 
 
 def parser(
-    about: str | None, *, device: str | None = "", data: bool = False, quick: str = "", parts: Iterable[str] = ()
+    about: str | None, *, device: bool = False, data: bool = False, quick: str = "", parts: Iterable[str] = ()
 ) -> argparse.ArgumentParser:
     """Return a parser with what benchmarks have in common; ``--out`` and ``--commit`` in any case.
 
     Args:
         about: The program's docstring.
-        device: Default of ``--device``: None is the first GPU, or the CPU; an empty text leaves the option out.
+        device: Whether there is ``--device``.
         data: Whether there is ``--data``, the folder of captures.
         quick: What ``--quick`` does; empty leaves it out.
         parts: What ``--parts`` chooses from; empty leaves it out.
@@ -67,8 +68,9 @@ def parser(
     made = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--out", type=Path, required=True, metavar="JSON", help="what is written, for tables.py to print")
     made.add_argument("--commit", default=commit(), help="recorded; by default that of this checkout")
-    if device != "":
-        made.add_argument("--device", default=device, help="cpu or cuda:0")
+    if device:
+        first = str(resolve_device(None))
+        made.add_argument("--device", default=first, help=f"by default the first GPU, or the CPU: here {first}")
     if data:
         made.add_argument("--data", type=Path, default=Path(os.environ.get("BEAM_DATA", ROOT.parent / "shared/data")))
     if quick:

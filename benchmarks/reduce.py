@@ -302,7 +302,7 @@ PARTS = {"certified": certified, "sizes": sizes}
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", quick="the figure, small, a few steps", parts=PARTS)
+    parser = record.parser(__doc__, device=True, quick="the figure, small, a few steps", parts=PARTS)
     parser.add_argument("--made", type=Path, metavar="FOLDER", help="assets of captures, and what rivals made of them")
     parser.add_argument("--assets", nargs="+", default=["figure", *CAPTURES], metavar="NAME")
     parser.add_argument("--contenders", nargs="+", default=list(CONTENDERS), choices=CONTENDERS, metavar="NAME")

@@ -73,7 +73,7 @@ def bench_of_capture(capture: Capture, device: Any) -> Bench:
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", data=True, quick="the demo's capture, small", parts=PARTS)
+    parser = record.parser(__doc__, device=True, data=True, quick="the demo's capture, small", parts=PARTS)
     parser.add_argument("--captures", nargs="+", default=["walker", "runner", "robot"], help="names there")
     parser.add_argument("--assets", type=Path, metavar="DIR", help="decomposed reconstructions, NAME/asset.usda")
     parser.add_argument("--gaussians", type=int, help="other than by default, everywhere")

@@ -129,7 +129,7 @@ def flicker(bench: Bench) -> Iterator[Row]:
 
 def main() -> None:
     """Measure, and write the result."""
-    parser = record.parser(__doc__, device=None, quick="small and few steps, to see whether it runs")
+    parser = record.parser(__doc__, device=True, quick="small and few steps, to see whether it runs")
     parser.add_argument("--small", action="store_true", help="as much as a CPU does in some minutes")
     arguments = parser.parse_args()
     device = arguments.device

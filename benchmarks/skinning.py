@@ -122,7 +122,7 @@ def carried(
 
 
 def main() -> None:
-    parser = record.parser(__doc__, device=None)
+    parser = record.parser(__doc__, device=True)
     parser.add_argument("--capture", default="walker")
     parser.add_argument("--skins", type=int, default=40_000)
     options = parser.parse_args()

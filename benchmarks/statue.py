@@ -135,7 +135,7 @@ def sheet(pairs: list[NDArray[np.float64]]) -> NDArray[np.uint8]:
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", data=True)
+    parser = record.parser(__doc__, device=True, data=True)
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--gaussians", type=int, default=FitOptions().gaussian_count, metavar="N")
     parser.add_argument("--reduction", type=int, default=1, metavar="N", help="how much narrower images are")

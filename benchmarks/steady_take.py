@@ -167,7 +167,7 @@ PARTS = {"walk": partial(measure_take, case=False), "case": partial(measure_take
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cuda:0", data=True, quick="two frames of few Gaussians", parts=PARTS)
+    parser = record.parser(__doc__, device=True, data=True, quick="two frames of few Gaussians", parts=PARTS)
     parser.add_argument("--keep", type=Path, metavar="DIR", help="leave captures and assets in this folder")
     arguments = parser.parse_args()
     light = EnvironmentMap.read(arguments.data / "captures/walker/environment.exr")

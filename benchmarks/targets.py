@@ -112,7 +112,7 @@ def measured(case: tuple[str, str, float], factor: float, words: list[str], out:
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device=None)
+    parser = record.parser(__doc__, device=True)
     parser.add_argument("--runs", type=int, default=40, metavar="N")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--commands", nargs="+", metavar="NAME", help="only these; all of them without")

@@ -510,7 +510,7 @@ def sections(effort: Effort) -> dict[str, Callable[[Any], Iterator[Any]]]:
 
 
 def main() -> int:
-    parser = record.parser(__doc__, device="cpu", quick="fewer rays and repeats")
+    parser = record.parser(__doc__, device=True, quick="fewer rays and repeats")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     effort = QUICK if arguments.quick else ON_CUDA if device.is_cuda else ON_CPU
