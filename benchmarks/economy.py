@@ -188,7 +188,8 @@ def occlusion_of(subject: Subject, rays: int) -> list[dict[str, Any]]:
     lifted = (points.positions.numpy()[rows] + normals * points.offsets.numpy()[rows, None]).astype(np.float32)
 
     def traced(count: int, seed: int = 0) -> Any:
-        return ambient_occlusion(frame.scene, lifted, normals, sample_count=count, offset=0.0, seed=seed)
+        how: dict[str, Any] = {"offset": 0.0, "options": points.tracing, "seed": seed}
+        return ambient_occlusion(frame.scene, lifted, normals, sample_count=count, **how)
 
     truth = traced(rays, 1 << 31).visibility.astype(np.float64)
     found = {count: traced(count) for count in FIXED}

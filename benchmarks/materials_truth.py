@@ -26,6 +26,7 @@ from beam_warp.study.materials import without_color
 from beam_warp.study.true_surface import SHARP, colored_by_views, gaussians_on_mesh, surface_of_capture
 from beam_warp.trace.incident import irradiance
 from beam_warp.trace.scene import Scene
+from beam_warp.trace.transmittance import TraceOptions
 from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 from beam_warp.world.harmonics import SH_C0
@@ -223,10 +224,11 @@ def true_cloud(capture: Capture, frame: int, count: int, device: Any) -> Gaussia
 
 @dataclass(frozen=True, eq=False)
 class LightReference:
-    """Irradiance over pi at some points, by many rays, ``(P, 3)``, and its standard error."""
+    """Irradiance over pi at some points, by many rays, ``(P, 3)``, its standard error, and what is in rays' way."""
 
     points: NDArray[np.float32]
     normals: NDArray[np.float32]
+    tracing: TraceOptions
     value: NDArray[np.float64]
     standard_error: NDArray[np.float64]
 
@@ -234,13 +236,14 @@ class LightReference:
 def light_reference(
     scene: Scene, points: SurfacePoints, rows: NDArray[np.int64], light: PreparedEnvironment, rays: int
 ) -> LightReference:
-    """Trace many rays, half by the cosine and half by the light, from where measuring would: lifted points."""
+    """Trace many rays, half by the cosine, half by the light, from lifted points and past as much as measuring does."""
     normals = points.normals.numpy()[rows]
     lifted = (points.positions.numpy()[rows] + normals * points.offsets.numpy()[rows, None]).astype(np.float32)
-    found = irradiance(
-        scene, lifted, normals, light, sample_count=rays, density="mis", ratio=True, offset=0.0, seed=REFERENCE_SEED
+    how: Row = {"density": "mis", "ratio": True, "offset": 0.0, "options": points.tracing, "seed": REFERENCE_SEED}
+    found = irradiance(scene, lifted, normals, light, sample_count=rays, **how)
+    return LightReference(
+        lifted, normals, points.tracing, found.value.astype(np.float64), found.standard_error.astype(np.float64)
     )
-    return LightReference(lifted, normals, found.value.astype(np.float64), found.standard_error.astype(np.float64))
 
 
 def light_errors(scene: Scene, reference: LightReference, light: PreparedEnvironment, **how: Any) -> Row:
@@ -249,7 +252,8 @@ def light_errors(scene: Scene, reference: LightReference, light: PreparedEnviron
     ``relative_rmse`` is relative to the irradiance at each point, or to a twentieth of its mean where it is less;
     ``rmse_over_mean`` to the mean.
     """
-    found = irradiance(scene, reference.points, reference.normals, light, offset=0.0, **how)
+    how |= {"offset": 0.0, "options": reference.tracing}
+    found = irradiance(scene, reference.points, reference.normals, light, **how)
     difference = np.float64(found.value) - reference.value
     mean = reference.value.mean()
     floor = np.maximum(reference.value, 0.05 * mean)

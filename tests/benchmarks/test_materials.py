@@ -79,6 +79,8 @@ class TestScores:
         assert errors[1]["relative_rmse"] < 0.5 * errors[0]["relative_rmse"]
         # Under even light, irradiance over pi is radiance times openness, the same in all channels.
         np.testing.assert_allclose(reference.value, reference.value[:, :1] * [1.0, 2.0, 3.0], rtol=1e-4)
+        # The layer that a point lies within is not in the way of its rays.
+        assert reference.value[:, 0].mean() > 0.5
 
     def test_true_points_are_those_of_the_mesh(self, perfect):
         points = perfect.points()
