@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,24 +21,16 @@ from beam_warp.world.gaussians import MATERIAL_CHANNELS, GaussianCloud
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnMaterials:
+class DrawnMaterials(PixelMeans):
     """One view of a cloud.
 
     Attributes:
         camera: The camera that sees it, of one sample a pixel.
-        alpha: Coverage in [0, 1], ``(H, W)``.
-        depth: Mean distance along the optical axis [m], ``(H, W)``.
-        channels: By name as in `GaussianCloud`, the mean over what the pixel sees, *not* multiplied by alpha,
-            ``(H, W)`` or ``(H, W, 3)``; ``normals`` are of unit length.
-        radiance: Captured colour, scene-linear and multiplied by alpha, ``(H, W, 3)``; None where it was not drawn.
-
-    All are float32; depth and channels are 0 where alpha is 0.
+        radiance: Captured colour, scene-linear and multiplied by alpha, ``(H, W, 3)`` float32; None where it was not
+            drawn.
     """
 
     camera: Camera
-    alpha: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    channels: Mapping[str, NDArray[np.float32]]
     radiance: NDArray[np.float32] | None
 
     def layers(self) -> dict[str, NDArray[np.float32]]:
@@ -76,10 +68,10 @@ def draw_materials(
     buffer = rasterize(cloud, camera.supersampled(samples), channels=names, options=raster, device=device)
     seen = PixelMeans.of(buffer, samples)
     return DrawnMaterials(
-        camera,
         seen.alpha,
         seen.depth,
         {name: seen.channels[name] for name in channels},
+        camera,
         block_means(seen_radiance(buffer, cloud), samples).astype(np.float32) if radiance else None,
     )
 
