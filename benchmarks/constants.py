@@ -223,7 +223,10 @@ class Subject:
 
 def reconstruct(subject: Subject, setup: Setup) -> GaussianCloud:
     """Fit the first frame."""
-    track, _ = FitAndTrack(fitting=setup.fit, device=subject.device).begin(subject.views[0], no_progress)
+    assert subject.capture.environment_path is not None
+    light = EnvironmentMap.read(subject.capture.environment_path)
+    steps = FitAndTrack(fitting=setup.fit, environment=light, device=subject.device)
+    track, _ = steps.begin(subject.views[0], no_progress)
     return track.cloud
 
 

@@ -68,7 +68,9 @@ def reconstruction(bench: Bench, name: str) -> GaussianSequence:
         return converters.read(bench.assets / name / "gaussians.usda")
     effort, capture = bench.effort, bench.captures[name]
     fitting = FitOptions.of_preset("fast", gaussian_count=effort.gaussians, **(effort.fitting or {}))
-    steps = FitAndTrack(fitting=fitting, device=str(bench.device))
+    assert capture.environment_path is not None
+    light = EnvironmentMap.read(capture.environment_path)
+    steps = FitAndTrack(fitting=fitting, environment=light, device=str(bench.device))
     options = ReconstructOptions(frames=capture.frames[: effort.frames])
     return reconstruct(capture, bench.folder / f"{name}_gaussians", steps, options).sequence
 

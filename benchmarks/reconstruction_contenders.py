@@ -27,6 +27,7 @@ from beam_warp.reconstruction.fit import FitOptions
 from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
 from beam_warp.world.camera import Camera
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import WORLD_AXES, GaussianCloud, GaussianSequence
 from beam_warp.world.metadata import capture_frames_metadata
 
@@ -102,14 +103,20 @@ class ModelledFrame:
 def follow(
     contender: Contender, capture: Capture, frames: Sequence[int], device: Any, *, track: Any = None
 ) -> Iterator[ModelledFrame]:
-    """Fit the first of some frames, unless there is a track already, and track the others; reading is not timed."""
+    """Fit the first of some frames, unless there is a track already, and track the others; reading is not timed.
+
+    Ours is told the capture's light, as jobs tell it.
+    """
+    steps = contender.steps
+    if isinstance(steps, FitAndTrack) and capture.environment_path is not None:
+        steps = replace(steps, environment=EnvironmentMap.read(capture.environment_path))
     for frame in frames:
         views = _read(capture, frame)
         started = time.perf_counter()
         if track is None:
-            track, report = contender.steps.begin(views, no_progress)
+            track, report = steps.begin(views, no_progress)
         else:
-            track, report = contender.steps.advance(track, views, no_progress)
+            track, report = steps.advance(track, views, no_progress)
         if device.is_cuda:
             wp.synchronize_device(device)
         seconds = time.perf_counter() - started

@@ -108,6 +108,8 @@ class BackwardBuffers:
             inputs = (gaussians.positions, gaussians.radiance, drawn.views)
             colors = (drawn.blocks.colors, self._blocks.colors)
             launch_evaluate_colors_adjoint(*inputs, *colors, found.positions, found.radiance, device, moves)
+            if gaussians.extra is not None:
+                gaussians.extra.differentiate(gaussians, drawn.views, self._blocks.colors)
         launch_project_adjoint(gaussians[:4], drawn.views, drawn.projection, self._tracked, found[:4], device, moves)
         if cameras is not None:
             launch_sum_cameras(cameras.rows, drawn.splats, cameras.lanes, to_cameras, device)

@@ -65,6 +65,8 @@ def evaluate_colors(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:
         seen = (gaussians.positions, gaussians.radiance, buffers.views, buffers.blocks.colors)
         with buffers.beside(buffers.gathering):
             launch_evaluate_colors(*seen, buffers.device)
+            if gaussians.extra is not None:
+                gaussians.extra.add(gaussians, buffers.views, buffers.blocks.colors)
 
 
 def gather_channels(buffers: FrameBuffers, gaussians: GaussianArrays) -> None:

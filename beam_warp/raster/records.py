@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import warp as wp
 
@@ -74,6 +74,16 @@ class RasterOptions:
         return raster_metadata(self.antialiased, self.low_pass)
 
 
+class ExtraColors(Protocol):
+    """Colours that splats have beside captured radiance, which whoever draws states."""
+
+    def add(self, gaussians: GaussianArrays, views: wp.array, colors: wp.array) -> None:
+        """Add to the colours of splats, ``(V * N,)`` vec3; ``views`` are of ``kernels.raster.project.RasterView``."""
+
+    def differentiate(self, gaussians: GaussianArrays, views: wp.array, color_gradients: wp.array) -> None:
+        """Take a loss's derivatives to the colours of splats: what they depend on is not the rasteriser's."""
+
+
 class GaussianArrays(NamedTuple):
     """Gaussians on a device.
 
@@ -85,6 +95,7 @@ class GaussianArrays(NamedTuple):
         values: ``(N, K)`` float, to be composited; None for nothing.
         radiance: ``(N, B)`` vec3 spherical harmonics of captured colour, B of `COEFFICIENT_COUNTS`, another one in
             every draw if need be; None for none.
+        extra: What is added to the captured colour; None for nothing.
     """
 
     positions: wp.array
@@ -93,6 +104,7 @@ class GaussianArrays(NamedTuple):
     opacities: wp.array
     values: wp.array | None = None
     radiance: wp.array | None = None
+    extra: ExtraColors | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +131,8 @@ class RasterImages:
 
 
 class GaussianGradients(GaussianArrays):
-    """Derivatives of a loss with respect to Gaussians, on the device, in the shapes and order of `GaussianArrays`.
+    """Derivatives of a loss with respect to Gaussians, on the device, in the shapes and order of `GaussianArrays`;
+    ``extra`` is None.
 
     ``orientations`` are to the quaternions as given, and orthogonal to them.
     """

@@ -36,6 +36,7 @@ from beam_warp.reconstruction.sampling_limits import SamplingLimits
 from beam_warp.reconstruction.targets import LossWeights, TargetSet, ViewTargets, chosen_samples, shuffled_views
 from beam_warp.reconstruction.temporal import TemporalTerms
 from beam_warp.reconstruction.total_variation import RadianceVariation, chosen_variation
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import GaussianCloud
 
 PRESETS = ("fast", "draft", "paper", "rade")
@@ -75,6 +76,10 @@ and what is left out is missed."""
 LEAST_DROPOUT, MOST_DROPOUT = 0.005, 0.2
 """Below the first, nothing is left out, as if photographs were clean. The second is the largest part that was tried."""
 
+BANDS_BESIDE = 0.1
+"""Rate of what depends on the direction beside reflections, over its rate without: light from elsewhere and what hides
+the environment are left to it."""
+
 AS_IF_CLEAN: Mapping[str, Any] = MappingProxyType({"dropout": 0.0, "total_variation": 0.0})
 """Options of `FitOptions` that heed noise, without heed: of fits whose steps are too few to learn it."""
 
@@ -104,6 +109,7 @@ class LearningRates:
         bands: Rate of all other bands.
         final_positions: Part of the positions' rate that is left at the end; it falls by the same factor every step.
         final_others: Part of all other rates that is left at the end, likewise.
+        gloss: Rate of the logits of roughness and of the open part of lobes, where a light is known.
 
     Raises:
         InvalidOptionError: A rate is negative or no number.
@@ -117,6 +123,7 @@ class LearningRates:
     bands: float = 5e-4
     final_positions: float = 0.01
     final_others: float = 0.3
+    gloss: float = 2e-2
 
     def __post_init__(self) -> None:
         """Check every rate once: the last of the positions is not reached before many steps are taken."""
@@ -154,6 +161,8 @@ class FitOptions:
         reset_below: With fewer photographs, of known coverage, the refinement after `RESET_AFTER` of `RESET_STEPS` or
             more lowers all opacities to `RESET_OPACITY` (Kerbl et al. 2023): a layer that few of them agree on hides
             others no more, and must earn its opacity again.
+        reflect_until: Part of all steps in which Gaussians reflect the light, if it is known; then harmonics stand for
+            what they reflect. 0: harmonics from the start.
         seed: Same seed, same device, same result.
 
     Raises:
@@ -179,6 +188,7 @@ class FitOptions:
     dropout: float | Literal["auto"] = "auto"
     total_variation: float | Literal["auto"] = "auto"
     reset_below: int = PLENTY
+    reflect_until: float = 0.85
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -191,7 +201,7 @@ class FitOptions:
         require_count("sh_degree", self.sh_degree, 0, 4)
         if self.samples != "auto":
             require_count("samples", self.samples, 1, 8)
-        for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity"):
+        for name in ("refine_until", "split_fraction", "hidden_share", "dead_opacity", "reflect_until"):
             require_number(name, getattr(self, name), 0.0, 1.0)
         require_number("temporal", self.temporal, 0.0)
         if self.dropout != "auto":
@@ -215,7 +225,7 @@ class FitOptions:
         require_choice("preset", preset, PRESETS)
         rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
         common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
-        common |= {**AS_IF_CLEAN, "reset_below": 0}
+        common |= {**AS_IF_CLEAN, "reset_below": 0, "reflect_until": 0.0}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
             "draft": {
@@ -294,6 +304,7 @@ def fit_gaussians(
     start: GaussianCloud,
     options: FitOptions | None = None,
     *,
+    environment: EnvironmentMap | None = None,
     device: str | None = None,
     progress: StepProgress = no_progress,
 ) -> Fit:
@@ -304,6 +315,8 @@ def fit_gaussians(
         start: Where steps begin, with scene-linear radiance, such as `initial_gaussians` gives; some of them, evenly
             chosen, where there are more than may be.
         options: See `FitOptions`.
+        environment: The light of the photographs, which Gaussians reflect while they are fitted; not with a target
+            PSNR. None if it is not known.
         device: Warp device; None takes the first CUDA device, or the CPU.
         progress: Called with (done, total, facts).
 
@@ -320,7 +333,7 @@ def fit_gaussians(
     target = resolve_device(device)
     began = time.perf_counter()
     if chosen.target_psnr is None:
-        fitter = Fitter(views, start, chosen, target)
+        fitter = Fitter(views, start, chosen, target, environment=environment)
         fitter.run(progress)
         report = fitter.report()
     else:
@@ -379,12 +392,17 @@ class Fitter:
         options: FitOptions,
         device: Any,
         targets: TargetSet | None = None,
+        *,
+        environment: EnvironmentMap | None = None,
     ) -> None:
         """Bring everything to the device, but for ``targets`` that are there already; see `fit_gaussians`."""
         self.options = options
         self.device = device
         count = max(options.gaussian_count, len(start)) if options.refine_every else len(start)
-        self.parameters = GaussianParameters(start, device, row_count=count, sh_degree=options.sh_degree)
+        light = environment if options.reflect_until > 0.0 else None
+        self.parameters = GaussianParameters(
+            start, device, row_count=count, sh_degree=options.sh_degree, environment=light
+        )
         self.samples = chosen_samples(options.samples, start, views)
         asked = "auto" in (options.dropout, options.total_variation)
         pixels, noise = noise_of_views(views if asked else ())
@@ -401,7 +419,8 @@ class Fitter:
             "log_scales": rates.scales,
             "logits": rates.opacities,
             "color": rates.color,
-            "bands": rates.bands,
+            "bands": rates.bands if light is None else BANDS_BESIDE * rates.bands,
+            **({} if light is None else {"gloss": rates.gloss}),
         }
         self._adam: Adam = self.parameters.optimizer(self._rates)
         self._gradient_sums = wp.zeros(count, dtype=float, device=device)
@@ -432,6 +451,8 @@ class Fitter:
             if iteration == total // 2:
                 self._left_out = self.dropout[1]
                 self._graphs.clear()
+            if iteration == round(chosen.reflect_until * total):
+                self._settle_reflections()
             if iteration % PROGRESS_EVERY == 0:
                 self._set_rates(iteration / max(total - 1, 1))
                 progress(iteration, total, facts)
@@ -444,6 +465,7 @@ class Fitter:
                 self._refine(is_late=self._taken >= RESET_AFTER * total)
             if is_due or self._taken % RENEW_EVERY == 0:
                 facts = {"gaussians": float(self.parameters.alive().sum()), "psnr": self._renew()}
+        self._settle_reflections()
         facts["psnr"] = self._renew()
         progress(total, total, facts)
 
@@ -523,6 +545,16 @@ class Fitter:
         if self._variation is not None:  # as photographs' differences count: for each pixel of the view
             self._variation.add_gradients(self.total_variation / (group.height * group.width))
         self._adam.step()
+
+    def _settle_reflections(self) -> None:
+        """Let harmonics stand for reflections, if these were drawn until now."""
+        if self.parameters.reflections is None:
+            return
+        self.parameters.activate()  # the last step may have left some out
+        self.parameters.settle_reflections(self._targets.seen_directions(self.parameters.drawn))
+        self._rates["bands"] = self.options.rates.bands
+        self._graphs.clear()
+        self._renew()
 
     def _refine(self, *, is_late: bool) -> None:
         """Drop Gaussians that are not seen, split those of large gradients into their rows, reset opacities once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,6 +25,8 @@ from beam_warp.kernels.reconstruction.activation import (
 )
 from beam_warp.raster.adam import Adam, Parameters
 from beam_warp.raster.records import GaussianArrays, GaussianGradients
+from beam_warp.reconstruction.reflections import Reflections
+from beam_warp.world.environment import EnvironmentMap
 from beam_warp.world.gaussians import MAX_SH_DEGREE, GaussianCloud
 
 SMALLEST_SCALE = 1e-7
@@ -44,10 +47,19 @@ class GaussianParameters:
         positions: ``(N,)`` vec3 [m].
         orientations: ``(N,)`` quat xyzw, of any length.
         radiance: ``(N, B)`` vec3 spherical harmonics, scene-linear.
+        reflections: What they reflect of a known light; None without, and once `settle_reflections` was called.
         drawn: Gaussians as the rasteriser takes them; `activate` brings scales and opacities up to date.
     """
 
-    def __init__(self, cloud: GaussianCloud, device: Any, *, row_count: int | None = None, sh_degree: int = 2) -> None:
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        device: Any,
+        *,
+        row_count: int | None = None,
+        sh_degree: int = 2,
+        environment: EnvironmentMap | None = None,
+    ) -> None:
         """Bring a cloud to a device.
 
         Args:
@@ -55,6 +67,7 @@ class GaussianParameters:
             device: Warp device.
             row_count: Room for Gaussians, at least the cloud's; its number without.
             sh_degree: Of the radiance; the cloud's is cut or filled up with zeros.
+            environment: The light that Gaussians reflect, beside what their radiance says; None for none.
 
         Raises:
             InvalidArrayError: The cloud has no radiance, or not in scene-linear Rec.709.
@@ -87,6 +100,7 @@ class GaussianParameters:
             name: wp.zeros_like(getattr(self, name))
             for name in ("positions", "orientations", "radiance", "log_scales", "logits")
         }
+        self.reflections = None if environment is None else Reflections(environment, rows, device)
         self.drawn = GaussianArrays(
             self.positions,
             self.orientations,
@@ -94,7 +108,11 @@ class GaussianParameters:
             wp.zeros(rows, dtype=float, device=device),
             None,
             self.radiance,
+            self.reflections,
         )
+        if self.reflections is not None:
+            self.gloss = self.reflections.gloss
+            self._gradients["gloss"] = self.reflections.gradients
         self._turns = wp.zeros(rows, dtype=int, device=device)
         self._shapes = Shapes()
         self._shapes.log_scales, self._shapes.logits, self._shapes.filters = self.log_scales, self.logits, self.filters
@@ -120,10 +138,26 @@ class GaussianParameters:
         """
         launch_drop_out(len(self), part, seed, self._turns, self.drawn.opacities, self.device)
 
+    def settle_reflections(self, sides: NDArray[np.floating]) -> None:
+        """Let harmonics stand for what Gaussians reflect from now on: draw `drawn` anew.
+
+        Args:
+            sides: On which side of each it is seen, ``(N, 3)`` of any length.
+        """
+        if self.reflections is None:
+            return
+        degree = math.isqrt(self.radiance.shape[1]) - 1
+        radiance = self.radiance.numpy() + self.reflections.harmonics(self.drawn, sides, degree)
+        wp.copy(self.radiance, upload(radiance, wp.vec3, self.device))
+        self.drawn = self.drawn._replace(extra=None)
+        self.reflections.gradients.zero_()
+        self.reflections = None
+
     def zero_gradients(self) -> None:
-        """Begin a new sum of gradients."""
-        for array in self._gradients.values():
-            array.zero_()
+        """Begin a new sum of gradients; those of gloss are not a sum, but of the last frame."""
+        for name, array in self._gradients.items():
+            if name != "gloss":
+                array.zero_()
 
     def add_gradients(self, drawn: GaussianGradients) -> None:
         """Add the gradients of what was drawn, brought back to what is moved."""
@@ -147,8 +181,8 @@ class GaussianParameters:
         """Return an optimiser of the rows.
 
         Args:
-            rates: Learning rates of ``positions``, ``orientations``, ``log_scales``, ``logits``, ``color`` (band 0)
-                and ``bands`` (all others, if there are any); those left out stay.
+            rates: Learning rates of ``positions``, ``orientations``, ``log_scales``, ``logits``, ``color`` (band 0),
+                ``bands`` (all others, if there are any) and ``gloss`` (if they reflect); those left out stay.
 
         Raises:
             InvalidOptionError: There is no such group.
@@ -159,7 +193,7 @@ class GaussianParameters:
         if color.shape[1] > 3:
             groups["bands"] = (color[:, 3:], slope[:, 3:])
         for name in rates:
-            require_choice("rates", name, (*groups, "bands"))
+            require_choice("rates", name, (*groups, "bands", "gloss"))
         return Adam({name: Parameters(*groups[name], rate) for name, rate in rates.items() if name in groups})
 
     def rows(self) -> dict[str, Any]:

@@ -56,7 +56,8 @@ class FitAndTrack:
         fitting: How key frames are fitted.
         tracking: How other frames follow from the one before; drawn and compared as `fitting` says.
         points: Known points of the surfaces, for images without masks; None if there are none.
-        environment: The light of the capture, by which exposures are told from gloss; None if it is not known.
+        environment: The light of the capture, by which gloss is told from exposures and from shape; None if it is not
+            known.
         device: Warp device; None takes the first CUDA device, or the CPU.
     """
 
@@ -149,7 +150,8 @@ class FitAndTrack:
                     "outlines"
                 )
                 findings.append(Finding("warning", "few-cameras", what, remedy="Add cameras."))
-        fit = fit_gaussians(views, start, fitting, device=self.device, progress=progress)
+        known = self.environment if all(view.alpha is not None for view in views) else None
+        fit = fit_gaussians(views, start, fitting, environment=known, device=self.device, progress=progress)
         cloud = fit.cloud
         if is_bare:
             inner = np.flatnonzero(seen_in_common(views, cloud.positions))

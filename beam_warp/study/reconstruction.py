@@ -19,6 +19,7 @@ from beam_warp.reconstruction.steps import FitAndTrack
 from beam_warp.reconstruction.track import TrackOptions
 from beam_warp.study.table import Axis, Interval, Metric, Row, Settings, Study, StudySubject
 from beam_warp.study.tracing import device_name
+from beam_warp.world.environment import EnvironmentMap
 
 COLOR, NORMALS = "color_error", "normal_error"
 
@@ -90,12 +91,18 @@ def reconstruction_study(
     )
     presets = {count: preset for preset, count in steps.items()}
 
+    light = None if capture.environment_path is None else EnvironmentMap.read(capture.environment_path)
+
     def measure(settings: Settings) -> Row:
         chosen = np.linspace(0, len(views) - 1, int(settings["cameras"])).round().astype(int)
         preset = presets[int(settings["steps"])]
         fitting = FitOptions.of_preset(preset, gaussian_count=settings["gaussians"])
         work = FitAndTrack(
-            fitting=fitting, tracking=TrackOptions.of_preset(preset), points=capture.points(), device=str(target)
+            fitting=fitting,
+            tracking=TrackOptions.of_preset(preset),
+            points=capture.points(),
+            environment=light,
+            device=str(target),
         )
         started = time.perf_counter()
         track, report = work.begin([views[index] for index in chosen], no_progress)
