@@ -636,7 +636,7 @@ UNTUNED = {
         PathOptions: samples seed""",
     "not used, or another option's": """
         FitOptions: raster.near temporal
-        beam_warp.reconstruction.fit: AS_IF_CLEAN
+        beam_warp.reconstruction.fit: OF_FEW_STEPS
         TrackOptions: joints.weights.normal
         TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every refinement.dropout

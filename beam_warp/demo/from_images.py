@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +131,7 @@ def demo_from_images(
     timer = StageTimer(resolve_device(device))
     with timer("capture"):
         capture = demo_capture(out, options, device, seed, progress)
-    steps = replace(demo_steps(options, device=device, seed=seed), environment=next(iter(lights.values())))
+    steps = demo_steps(options, device=device, seed=seed)
     with timer("reconstruct"):
         found = reconstruct(
             capture,

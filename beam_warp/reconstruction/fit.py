@@ -80,8 +80,8 @@ BANDS_BESIDE = 0.1
 """Rate of what depends on the direction beside reflections, over its rate without: light from elsewhere and what hides
 the environment are left to it."""
 
-AS_IF_CLEAN: Mapping[str, Any] = MappingProxyType({"dropout": 0.0, "total_variation": 0.0})
-"""Options of `FitOptions` that heed noise, without heed: of fits whose steps are too few to learn it."""
+OF_FEW_STEPS: Mapping[str, Any] = MappingProxyType({"dropout": 0.0, "total_variation": 0.0, "reflect_until": 0.0})
+"""Options of `FitOptions` for fits whose steps are too few to learn noise, or how rough what reflects is."""
 
 PLENTY = 24
 """Photographs from which on each Gaussian is seen by as many as on the captures that the schedule was chosen on."""
@@ -214,10 +214,10 @@ class FitOptions:
         """Return the options of a preset, some of them changed.
 
         ``fast`` is ours, ``draft`` a seventh of its steps, larger ones: for a first look, and for a CPU. They are too
-        few to learn noise, so nothing is left out of them, nor held even. ``paper`` is BEAM's schedule: 7,000 steps for
-        colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no term of coverage. ``rade`` is that of
-        RaDe-GS scaled to as many steps: no low-pass on the image but the 3D filter, normals at 0.05 for the second
-        half. The latter two draw one sample a pixel.
+        few to learn noise, so nothing is left out of them, nor held even; nor do Gaussians reflect in them. ``paper``
+        is BEAM's schedule: 7,000 steps for colour, then 5,000 with normals at a weight of 0.03, the rates of 3DGS, no
+        term of coverage. ``rade`` is that of RaDe-GS scaled to as many steps: no low-pass on the image but the 3D
+        filter, normals at 0.05 for the second half. The latter two draw one sample a pixel.
 
         Raises:
             InvalidOptionError: There is no such preset, or an option is out of range.
@@ -225,7 +225,7 @@ class FitOptions:
         require_choice("preset", preset, PRESETS)
         rates = LearningRates(1.6e-4, 1e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4, final_others=1.0)
         common: dict[str, Any] = {"rates": rates, "samples": 1, "sh_degree": 3, "split_fraction": 0.05}
-        common |= {**AS_IF_CLEAN, "reset_below": 0, "reflect_until": 0.0}
+        common |= {**OF_FEW_STEPS, "reset_below": 0}
         options: dict[str, dict[str, Any]] = {
             "fast": {},
             "draft": {
@@ -233,7 +233,7 @@ class FitOptions:
                 "normal_iterations": 300,
                 "refine_every": 100,
                 "rates": LearningRates(positions=8e-4, scales=2e-2, opacities=6e-2, bands=1e-3, final_others=1.0),
-                **AS_IF_CLEAN,
+                **OF_FEW_STEPS,
             },
             "paper": {
                 **common,

@@ -34,7 +34,7 @@ from beam_warp.image.metrics import block_means
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.channels import RADIANCE
 from beam_warp.raster.gbuffer import rasterize
-from beam_warp.reconstruction.fit import AS_IF_CLEAN, FitOptions, Fitter, LearningRates
+from beam_warp.reconstruction.fit import OF_FEW_STEPS, FitOptions, Fitter, LearningRates
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.initial import initial_gaussians
 
@@ -168,7 +168,7 @@ def _shown_offsets(views: Sequence[CapturedView], options: FitOptions, device: A
         samples=1,
         temporal=0.0,
         refine_every=0,
-        **AS_IF_CLEAN,
+        **OF_FEW_STEPS,
     )
     fitter = Fitter(reduced, start, fitting, device)
     fitter.run()

@@ -42,7 +42,7 @@ from beam_warp.errors import AssetFormatError, InvalidArrayError
 from beam_warp.image.metrics import root_mean_square
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.reconstruction.alignment import NUMBERS, Evidence, evidence, flow_of, rows_of, strength
-from beam_warp.reconstruction.fit import AS_IF_CLEAN, FitOptions, Fitter, LearningRates
+from beam_warp.reconstruction.fit import OF_FEW_STEPS, FitOptions, Fitter, LearningRates
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.initial import initial_gaussians
 from beam_warp.reconstruction.labels import agreement_of
@@ -306,7 +306,7 @@ class RigFitter(Fitter):
             samples=1,
             temporal=0.0,
             refine_every=0,
-            **AS_IF_CLEAN,
+            **OF_FEW_STEPS,
         )
         super().__init__(reduced, start, fitting, device)
         self.cameras = list(cameras)

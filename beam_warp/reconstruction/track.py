@@ -23,7 +23,7 @@ from beam_warp.image.color import LINEAR_REC709
 from beam_warp.jobs.listeners import no_progress
 from beam_warp.raster.sources import upload_gaussians
 from beam_warp.reconstruction.far_motion import Silhouette, pose_on_hull, squares_outside
-from beam_warp.reconstruction.fit import AS_IF_CLEAN, NO_PSNR, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
+from beam_warp.reconstruction.fit import NO_PSNR, OF_FEW_STEPS, PRESETS, FitOptions, Fitter, LearningRates, mean_psnr
 from beam_warp.reconstruction.frames.protocols import StepProgress
 from beam_warp.reconstruction.joint_tracking import JointOptions, JointPose, JointTracker
 from beam_warp.reconstruction.joints.graph import JointGraph, torn_fraction
@@ -75,7 +75,7 @@ class TrackOptions:
             normal_iterations=400,
             rates=LearningRates(1e-4, 1e-3, 2e-3, 1e-2, 5e-3, 2.5e-4, final_positions=0.1, final_others=1.0),
             temporal=1e-3,
-            **AS_IF_CLEAN,
+            **OF_FEW_STEPS,
         )
     )
     largest_drop: float = 6.0
