@@ -77,6 +77,7 @@ class Constant:
 
 
 FIT = "beam_warp.reconstruction.fit:"
+REFLECTIONS = "beam_warp.reconstruction.reflections:"
 INITIAL = "beam_warp.reconstruction.initial:"
 TRACK = "beam_warp.reconstruction.track:"
 JOINTS = "beam_warp.reconstruction.joint_tracking:"
@@ -238,6 +239,20 @@ TRACKING = (
             ("MOST_VARIATION", ALL + ", a painted ball", "Largest weight."),
             ("NEIGHBORS", JUDGED, "Neighbours that radiance is compared with."),
             ("ROUNDING", JUDGED, "Difference below which it counts by its square."),
+        )
+    ),
+    Constant(FIT + "FitOptions.reflect_until", ALL, "Part of the steps in which Gaussians reflect.", most=1.0),
+    Constant(FIT + "FitOptions.rates.gloss", JUDGED, "Step of the logits of roughness and openness."),
+    Constant(FIT + "BANDS_BESIDE", ALL, "Rate of harmonics beside reflections, over that without."),
+    Constant(REFLECTIONS + "FIRST_GLOSS", JUDGED, "Logits that roughness and openness begin with."),
+    Constant(REFLECTIONS + "RIDGE", JUDGED, "Weight of small coefficients of what is reflected."),
+    Constant(REFLECTIONS + "DIRECTIONS", JUDGED, "Directions by which coefficients are found."),
+    *(
+        Constant("beam_warp.kernels.reconstruction.reflections:" + name, JUDGED, does)
+        for name, does in (
+            ("LEAST_ROUGHNESS", "Least roughness of a Gaussian that reflects."),
+            ("LEAST_FACING", "Least cosine by which it reflects."),
+            ("LOGIT_STEP", "Half the difference by which its slope is found."),
         )
     ),
     Constant(FIT + "EARLY_DROPOUT", ALL, "Part that a step leaves out in the first half, where it can be spared."),
@@ -640,11 +655,13 @@ UNTUNED = {
         TrackOptions: joints.weights.normal
         TrackOptions: refinement.weights refinement.raster refinement.sh_degree refinement.seed
         TrackOptions: refinement.gaussian_count refinement.color_iterations refinement.refine_every refinement.dropout
-        TrackOptions: refinement.reset_below refinement.total_variation
+        TrackOptions: refinement.reset_below refinement.total_variation refinement.reflect_until
+        TrackOptions: refinement.rates.gloss
         TrackOptions: refinement.refine_until refinement.split_fraction refinement.hidden_share refinement.dead_opacity
         BakeOptions: passes ridge temporal low high""",
     "limits of memory, time and floating point, and sizes of blocks": """
         beam_warp.reconstruction.fit: NO_PSNR PROGRESS_EVERY
+        beam_warp.reconstruction.reflections: ROWS_AT_ONCE
         beam_warp.reconstruction.frames.reader: LOADING_THREADS
         beam_warp.reconstruction.frames.store: ID_BITS
         beam_warp.reconstruction.gains: LARGEST_SIDE MOST_POINTS DARKEST ROUNDS SETTLED

@@ -168,14 +168,14 @@ def still(**rates):
 
 
 def fitter_of(views, light, device, **changes):
-    """Of matte grey discs, in the right places."""
+    """A fit of matte grey discs in the right places."""
     kept = {"color_iterations": 0, "normal_iterations": 240, "refine_every": 0, "samples": 1, "sampling_filter": False}
     options = FitOptions(**{**kept, "rates": still(), "gaussian_count": 300, **changes})
     return Fitter(views, ball_cloud(300, painted=False), options, wp.get_device(device), environment=light)
 
 
 def test_roughness_and_openness_are_found(device):
-    """Of discs in the right places, whose paint is not known: within .06; so near, harmonics come to a fifth of it."""
+    """Discs in the right places, of unknown paint: within .06, and five times nearer than harmonics come."""
     light = LIGHTS["studio"]
     views = photographs(device, glossy(device, light, 300, roughness=0.35, part=0.6, radiance=-0.8), rig(10))
     fitter, plain = (fitter_of(views, known, device, rates=still(gloss=0.05)) for known in (light, None))

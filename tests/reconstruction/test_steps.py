@@ -62,3 +62,21 @@ def test_exposures_are_compared_where_the_frame_begins(monkeypatch):
     assert len(fits) == 3
     assert steps.find_exposures(list("abc"), views[:3], no_progress) is None
     assert len(fits) == 3
+
+
+@pytest.mark.parametrize(
+    ("masked", "lit", "reflects"), [(True, True, True), (True, False, False), (False, True, False)]
+)
+def test_key_frames_of_masked_photographs_reflect_the_light(monkeypatch, masked, lit, reflects):
+    """What lies around a subject without masks does not see the same environment."""
+    lights = []
+
+    def noted(views, *args, environment, **more):
+        lights.append(environment)
+        return fit_gaussians(views, *args, environment=environment, **more)
+
+    monkeypatch.setattr("beam_warp.reconstruction.steps.fit_gaussians", noted)
+    light = EnvironmentMap.constant([1.0] * 3) if lit else None
+    views = ball_views(rig(6), with_alpha=masked)
+    FitAndTrack(fitting=FITTING, tracking=TRACKING, environment=light, device="cpu").begin(views, no_progress)
+    assert lights == [light if reflects else None]
