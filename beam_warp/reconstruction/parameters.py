@@ -47,6 +47,7 @@ class GaussianParameters:
         positions: ``(N,)`` vec3 [m].
         orientations: ``(N,)`` quat xyzw, of any length.
         radiance: ``(N, B)`` vec3 spherical harmonics, scene-linear.
+        gloss: Logits of roughness and of the open part of lobes, ``(N,)`` vec2; only with a known light.
         reflections: What they reflect of a known light; None without, and once `settle_reflections` was called.
         drawn: Gaussians as the rasteriser takes them; `activate` brings scales and opacities up to date.
     """
