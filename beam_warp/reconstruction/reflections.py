@@ -31,7 +31,8 @@ FIRST_GLOSS = (0.0, 0.85)
 """Logits with which fits begin: halfway between smooth and rough, and seven tenths of the lobe open."""
 
 DIRECTIONS = 96
-"""Directions of a sphere towards which reflections are evaluated for their harmonics: ten for each coefficient."""
+"""Directions of a sphere towards which reflections are evaluated for their harmonics: a Gaussian faces half of them,
+five for each coefficient."""
 
 RIDGE = 0.01
 """Weight of small coefficients, over that of what a Gaussian shows: the side that it turns away says nothing."""
