@@ -241,9 +241,11 @@ TRACKING = (
             ("ROUNDING", JUDGED, "Difference below which it counts by its square."),
         )
     ),
-    Constant(FIT + "FitOptions.reflect_until", ALL, "Part of the steps in which Gaussians reflect.", most=1.0),
+    Constant(
+        FIT + "FitOptions.reflect_until", "walker, robot", "Part of the steps in which Gaussians reflect.", most=1.0
+    ),
     Constant(FIT + "FitOptions.rates.gloss", JUDGED, "Step of the logits of roughness and openness."),
-    Constant(FIT + "BANDS_BESIDE", ALL, "Rate of harmonics beside reflections, over that without."),
+    Constant(FIT + "BANDS_BESIDE", "walker, robot", "Rate of harmonics beside reflections, over that without."),
     Constant(REFLECTIONS + "FIRST_GLOSS", JUDGED, "Logits that roughness and openness begin with."),
     Constant(REFLECTIONS + "RIDGE", JUDGED, "Weight of small coefficients of what is reflected."),
     Constant(REFLECTIONS + "DIRECTIONS", JUDGED, "Directions by which coefficients are found."),

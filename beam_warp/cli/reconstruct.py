@@ -176,22 +176,24 @@ def modelling_for(target: Target, modelling: Modelling, asked: Asked, started: f
     plan = plan_frames(asked.capture, options_of(modelling, asked.capture).frames, modelling.segment_length)
     frames, keys = tuple(plan.records), len(plan.segments)
     ladder, folders = _ladder(modelling), count()
+    # Drafts do not reflect a known light. The longer fits that they tell the costs of do, for most of their steps.
+    as_long = {"reflect_until": FitOptions().reflect_until}
 
     def elapsed() -> float:
         return time.perf_counter() - started
 
     with TemporaryDirectory() as folder:
 
-        def pilot(settings: Settings, few: tuple[int, ...]) -> tuple[float, float]:
+        def pilot(settings: Settings, few: tuple[int, ...], **fitting: float) -> tuple[float, float]:
             words, began = replace(modelling, **settings), time.perf_counter()
-            steps = steps_of(words, asked.capture, asked.seed, asked.device, asked.light)
+            steps = steps_of(words, asked.capture, asked.seed, asked.device, asked.light, **fitting)
             options = replace(options_of(modelling, asked.capture), frames=few)
             found = reconstruct_capture(asked.capture, Path(folder) / str(next(folders)), steps, options)
             return time.perf_counter() - began, _error(found.report)
 
         tracked = 0.0
         if target.seconds is not None or target.fps is not None:
-            pilot(ladder[0], frames[:1])  # compiles
+            pilot(ladder[0], frames[:1], **as_long)  # compiles
             if len(frames) > keys:
                 both, first = (pilot(ladder[0], frames[:number])[0] for number in (2, 1))
                 tracked = max(both - first, 0.0) / first
@@ -212,7 +214,7 @@ def modelling_for(target: Target, modelling: Modelling, asked: Asked, started: f
             steps = fit.color_iterations + fit.normal_iterations
             return [steps, steps * float(settings["gaussians"])]
 
-        seconds = [pilot(settings, frames[:1])[0] for settings in ladder[:PILOTS]]
+        seconds = [pilot(settings, frames[:1], **as_long)[0] for settings in ladder[:PILOTS]]
         model = fitted([cost(settings) for settings in ladder[:PILOTS]], seconds)
         return cheapest([rung(settings, float(model @ cost(settings))) for settings in ladder], target)
 
@@ -240,9 +242,14 @@ def _error(report: dict[str, Any]) -> float:
 
 
 def steps_of(
-    modelling: Modelling, capture: Capture, seed: int, device: str | None, environment: EnvironmentMap | None
+    modelling: Modelling,
+    capture: Capture,
+    seed: int,
+    device: str | None,
+    environment: EnvironmentMap | None,
+    **fitting: float,
 ) -> FrameSteps:
-    """Return the steps that the words ask for, under a light that is known or not."""
+    """Return the steps that the words ask for, under a light that is known or not; some of `FitOptions` changed."""
     from beam_warp.reconstruction.fit import FitOptions
     from beam_warp.reconstruction.steps import FitAndTrack
     from beam_warp.reconstruction.track import TrackOptions
@@ -253,7 +260,7 @@ def steps_of(
     preset = modelling.preset or USUAL_PRESET
     tracking = TrackOptions.of_preset(preset)
     return FitAndTrack(
-        fitting=FitOptions.of_preset(preset, **asked),
+        fitting=FitOptions.of_preset(preset, **asked, **fitting),
         tracking=replace(tracking, refinement=replace(tracking.refinement, seed=seed)),
         points=capture.points(),
         environment=environment,

@@ -3,7 +3,7 @@
 Harmonics of low degree cannot show a highlight. Where nothing else may depend on the direction, fits imitate highlights
 by geometry: discs at wrong depths that only some cameras see. If the light is known, two numbers for a Gaussian say
 more: how rough it is, and which part of the lobe is open. Its normal is that of its disc, which is left as it is:
-slopes of highlights bent flat faces, where light from other parts of the subject is taken for the environment's.
+turned by the slopes of highlights, discs of flat faces bent.
 """
 
 from __future__ import annotations

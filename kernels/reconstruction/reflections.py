@@ -45,7 +45,7 @@ def roughness_of(logit: float) -> float:
 
 @wp.func
 def thin_axis(reflectors: Reflectors, i: int, side: wp.vec3) -> wp.vec3:
-    """Unit normal of a Gaussian, on a side; 0 for one without orientation."""
+    """Unit normal of a Gaussian, on a side."""
     axis = smallest_axis(reflectors.scales[i])
     own = wp.vec3(wp.where(axis == 0, 1.0, 0.0), wp.where(axis == 1, 1.0, 0.0), wp.where(axis == 2, 1.0, 0.0))
     normal = wp.quat_rotate(wp.normalize(reflectors.orientations[i]), own)

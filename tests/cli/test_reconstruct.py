@@ -30,7 +30,7 @@ def asked(monkeypatch):
     """What was asked of the steps; the fake does them."""
     found = []
 
-    def steps_of(modelling, capture, seed, device, environment):
+    def steps_of(modelling, capture, seed, device, environment, **fitting):
         found.append((modelling, seed, device))
         return FakeSteps(count=modelling.gaussians or 60, seed=seed)
 

@@ -62,8 +62,8 @@ def captured(tmp_path, monkeypatch):
     """A capture, and the steps that were asked for; fakes do them, each with the same error."""
     asked = []
 
-    def steps_of(modelling, capture, seed, device, environment):
-        asked.append((modelling.gaussians, modelling.preset))
+    def steps_of(modelling, capture, seed, device, environment, **fitting):
+        asked.append((modelling.gaussians, modelling.preset, *fitting))
         return FakeSteps(count=60, seed=seed)
 
     monkeypatch.setattr("beam_warp.cli.reconstruct.steps_of", steps_of)
@@ -78,6 +78,13 @@ def test_reconstruction(captured, tmp_path, capsys):
     assert target["chosen"] == {"gaussians": 6250, "preset": "draft"}
     assert target["met"]
     assert asked == [(6250, "draft")] * 2  # the pilot and the job
+    asked.clear()
+    assert beam(*words, "--target-seconds", 1e6) == 0
+    chosen = said(capsys)["target"]["chosen"]
+    drafts = [(count, "draft", "reflect_until") for count in (6250, 12_500, 25_000)]
+    assert asked[0] == drafts[0]  # compiles
+    assert asked[-4:-1] == drafts  # and these cost for each step what a longer one would
+    assert asked[-1] == (chosen["gaussians"], chosen["preset"])
     assert beam(*words, "--target-seconds", 1e6, "--gaussians", 80) == 0
     assert said(capsys)["target"]["chosen"]["gaussians"] == 80  # what is stated stays
 
