@@ -156,6 +156,7 @@ RECONSTRUCTION = (
     ),
     Constant(SEEN_COLORS + "LEAST_COVERAGE", JUDGED, "Coverage below which a pixel's colour does not count.", most=1.0),
     Constant("beam_warp.reconstruction.targets:MATTE_SHARE", ALL, "Coverage's weight before a backdrop.", EXACT_MASKS),
+    Constant("beam_warp.reconstruction.targets:RECUT_SHARE", BOTH, "Coverage's weight in moved masks.", EXACT_MASKS),
     Constant("beam_warp.raster.resolution:SAMPLES_PER_SPACING", WALKER, "Samples on the distance of neighbours."),
     Constant("beam_warp.raster.resolution:MOST_SAMPLES", WALKER, "Largest side of a pixel's square of samples."),
     Constant("beam_warp.reconstruction.targets:CROP_MARGIN", JUDGED, "Pixels around the subject that are looked at."),

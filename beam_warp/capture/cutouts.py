@@ -104,14 +104,15 @@ def taken_in(view: CapturedView, pixels: float) -> CapturedView:
     straight = view.color / np.maximum(view.alpha, LEAST_COVERAGE)[..., None]
     within = np.minimum(alpha, view.alpha)
     if not (within > SOLID_COLOR).any():
-        return replace(view, alpha=alpha, color=np.minimum(view.color, alpha[..., None]))
+        return replace(view, alpha=alpha, color=np.minimum(view.color, alpha[..., None]), is_recut=True)
     if pixels > 0.0:
         inner = _spread(straight, within > SOLID_COLOR).sum(axis=-1)
         alpha[straight.sum(axis=-1) < DARK * inner] = 0.0
         if ring_of(view).dim > FADES:
-            return replace(view, alpha=alpha)
+            return replace(view, alpha=alpha, is_recut=True)
     lit = (within > 2.0 * LEAST_COVERAGE) & (alpha > 0.0)
-    return replace(view, alpha=alpha, color=(_spread(straight, lit) * alpha[..., None]).astype(np.float32))
+    color = (_spread(straight, lit) * alpha[..., None]).astype(np.float32)
+    return replace(view, alpha=alpha, color=color, is_recut=True)
 
 
 def _spread(image: NDArray[np.floating], known: NDArray[np.bool_]) -> NDArray[np.floating]:

@@ -29,6 +29,7 @@ class CapturedView:
             tell where the subject ends, ``(H, W)`` float32; None for nothing of any.
         mask_offset: How far the file's mask reached beyond the subject before it was moved; None if nothing tells.
         uncut: The photograph as it was before the subject was cut out of it; None if it shows the subject alone.
+        is_recut: Whether ``alpha`` is an estimate in place of the file's, whose cut-out was too large or too small.
 
     Raises:
         InvalidArrayError: An array has another size than the camera, or a value is not finite or out of range.
@@ -41,6 +42,7 @@ class CapturedView:
     doubt: NDArray[np.float32] | None = None
     mask_offset: MaskOffset | None = None
     uncut: Uncut | None = None
+    is_recut: bool = False
 
     def __post_init__(self) -> None:
         """Check sizes and values once."""

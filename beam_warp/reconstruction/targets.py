@@ -41,8 +41,9 @@ CROP_MARGIN = 8
 CROP_STEP = 16
 """Sides of crops are multiples of a tile of the rasteriser [pixel]."""
 
-MATTE_SHARE = 0.4
-"""Part of the weight of coverage that counts where the backdrop is known: the photograph says what a matte guesses."""
+MATTE_SHARE, RECUT_SHARE = 0.2, 0.5
+"""Parts of the weight of coverage that count where it is an estimate: of a matte before a known backdrop, where the
+photograph says what the matte guesses, and of a cut-out whose mask was moved."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class LossWeights:
 
     l1: float = 0.8
     ssim: float = 0.2
-    alpha: float = 0.5
+    alpha: float = 1.0
     normal: float = 0.0
     normal_tolerance: float | None = None
 
@@ -159,6 +160,7 @@ class ViewTargets:
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
+        self._shares = [_share_of_coverage(view) for view in views]
         self._doubts = [None if view.doubt is None else upload(view.doubt, float, self.device) for view in views]
         self._subjects = [
             self.height * self.width if view.alpha is None else int((view.alpha > 0.5).sum()) for view in views
@@ -207,7 +209,8 @@ class ViewTargets:
 
     def kind(self, index: int) -> Hashable:
         """Return what views have in common that are compared by the same launches, when each was selected before."""
-        return self, *(of[index] is None for of in (self._alphas, self._doubts, self._backdrops))
+        parts = (self._alphas, self._doubts, self._backdrops)
+        return self, self._shares[index], *(of[index] is None for of in parts)
 
     def move_camera(self, index: int, camera: Camera) -> None:
         """Draw a view from another camera from now on.
@@ -250,7 +253,7 @@ class ViewTargets:
             self._to_covered.zero_()
             launch_average(self._alpha, self.samples, False, self._covered, self.device)
             launch_believe(doubt, alpha, self._covered, self.device)
-            weight = weights.alpha * (1.0 if self._backdrops[index] is None else MATTE_SHARE)
+            weight = weights.alpha * self._shares[index]
             terms.append(self._l1_alpha(self._covered, alpha, weight=weight, gradient=self._to_covered, value=values))
             launch_believe(doubt, None, self._to_covered, self.device)
             launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
@@ -365,6 +368,13 @@ class ViewTargets:
         parts, count = labelled
         largest = np.bincount(parts.ravel())[1:].max() if count else 0
         return largest / max(self._subjects[index], 1)
+
+
+def _share_of_coverage(view: CapturedView) -> float:
+    """Return the part of the weight of coverage that counts in a view."""
+    if view.uncut is not None:
+        return MATTE_SHARE
+    return RECUT_SHARE if view.is_recut else 1.0
 
 
 def _encoded(color: NDArray[np.float32], device: Any) -> wp.array:

@@ -47,4 +47,6 @@ def test_a_view_is_moved_with_its_colour(pixels, is_straight):
         assert found.color is view.color  # it has the true coverage
     else:
         np.testing.assert_allclose(found.color, found.alpha[..., None] * SUBJECT, atol=1e-6)
+    assert found.is_recut
     assert taken_in(view, 0.0) is view
+    assert not view.is_recut

@@ -24,6 +24,7 @@ from beam_warp.reconstruction.targets import (
     CROP_MARGIN,
     CROP_STEP,
     MATTE_SHARE,
+    RECUT_SHARE,
     LossWeights,
     TargetSet,
     ViewTargets,
@@ -251,7 +252,7 @@ def test_the_gradient_of_a_step_is_that_of_its_loss(device, size, samples, weigh
     assert max(errors.values()) <= 1e-5, errors
 
 
-def test_before_a_known_backdrop_a_matte_that_is_wrong_counts_less(device):
+def test_coverage_that_is_an_estimate_counts_less(device):
     """What is drawn is the scene: only coverage pulls at it, by its share of what it does where it is all there is."""
     (view,) = ball_views(rig(1))
     cloud, behind = ball_cloud(60), np.float32([0.2, 0.3, 0.4])
@@ -265,13 +266,17 @@ def test_before_a_known_backdrop_a_matte_that_is_wrong_counts_less(device):
     wrong = replace(view, color=color, alpha=grown)
     scene = color + (1.0 - alpha)[..., None] * behind
     pulls = []
-    for given in (wrong, replace(wrong, uncut=Uncut(scene, np.broadcast_to(behind, scene.shape)))):
+    before = replace(wrong, uncut=Uncut(scene, np.broadcast_to(behind, scene.shape)))
+    for given in (wrong, before, replace(wrong, is_recut=True)):
         targets, parameters = set_up([given], cloud, device, kind=ViewTargets)
         targets.draw(0, parameters.drawn)
         targets.add_losses(0, LossWeights(l1=1.0, ssim=0.2, alpha=1.0))
         pulls.append(targets.rasterizer.adjoints().alpha.numpy())
     assert np.abs(pulls[0]).sum() > 0.0
-    np.testing.assert_allclose(pulls[1], MATTE_SHARE * pulls[0], atol=0.02 * np.abs(pulls[0]).max())
+    for share, found in ((MATTE_SHARE, pulls[1]), (RECUT_SHARE, pulls[2])):
+        np.testing.assert_allclose(found, share * pulls[0], atol=0.02 * np.abs(pulls[0]).max())
+    together = ViewTargets([wrong, replace(wrong, is_recut=True)], len(cloud), RASTER, 1, device)
+    assert together.kind(0) != together.kind(1)  # a recorded step has the share of its kind
 
 
 def test_terms_that_count_nothing_ask_for_nothing(device):
