@@ -20,7 +20,7 @@ from beam_warp.cli.common.targets import TargetFlags, state
 from beam_warp.errors import InvalidOptionError
 from beam_warp.plan.crew import AUTO, crew_of
 from beam_warp.study.table import Settings
-from beam_warp.study.targets import Rung, Target, cheapest, climbed, fitted, in_words
+from beam_warp.study.targets import PILOT_PART, Rung, Target, cheapest, climbed, fitted, in_words
 from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
@@ -163,8 +163,9 @@ def modelling_for(target: Target, modelling: Modelling, asked: Asked, started: f
     """Choose Gaussians and schedule of a reconstruction that began at a time, by `time.perf_counter` [s].
 
     The first frame is fitted by settings that cost more and more, until one meets the target's error. Without an error,
-    the costs of the cheapest three tell those of all: time falls on steps, and on Gaussians times steps. Where frames
-    follow by tracking, the cheapest setting is tried with two of them.
+    the costs of the cheapest three tell those of all: time falls on steps, and on Gaussians times steps. Where they
+    take a pilot's part of the time, or one of them too long, no more is tried, and one of those that were is chosen.
+    Where frames follow by tracking, the cheapest setting is tried with two of them.
 
     Raises:
         InvalidOptionError: The target cannot be reached.
@@ -203,19 +204,25 @@ def modelling_for(target: Target, modelling: Modelling, asked: Asked, started: f
             job = whole * seconds
             return Rung(settings=settings, seconds=job, frame_seconds=job / len(frames), error=error, spent=elapsed())
 
-        def measure(settings: Settings) -> Rung:
-            return rung(settings, *pilot(settings, frames[:1]))
+        def measure(settings: Settings, **fitting: float) -> Rung:
+            return rung(settings, *pilot(settings, frames[:1], **fitting))
 
         if target.error is not None or len(ladder) <= PILOTS:
             return cheapest(climbed(ladder, measure, target, elapsed), target)
+        known: list[Rung] = []
+        for settings in ladder[:PILOTS]:
+            known.append(measure(settings, **as_long))
+            if not target.meets(known[-1]) or elapsed() > PILOT_PART * (target.seconds or math.inf):
+                break
+        if len(known) < PILOTS:  # no time to learn what others cost
+            return cheapest([replace(one, spent=elapsed()) for one in known], target)
 
         def cost(settings: Settings) -> list[float]:
             fit = FitOptions.of_preset(str(settings["preset"]))
             steps = fit.color_iterations + fit.normal_iterations
             return [steps, steps * float(settings["gaussians"])]
 
-        seconds = [pilot(settings, frames[:1], **as_long)[0] for settings in ladder[:PILOTS]]
-        model = fitted([cost(settings) for settings in ladder[:PILOTS]], seconds)
+        model = fitted([cost(one.settings) for one in known], [one.seconds / whole for one in known])
         return cheapest([rung(settings, float(model @ cost(settings))) for settings in ladder], target)
 
 

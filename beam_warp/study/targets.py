@@ -124,8 +124,11 @@ def cheapest(rungs: Sequence[Rung], target: Target) -> Rung:
 
 
 def unattainable(nearest: Rung, target: Target) -> InvalidOptionError:
-    """Return the refusal of a target, with what can be asked instead: what the nearest rung surely reaches."""
-    asked, sure = target.asked(), nearest.surely()
+    """Return the refusal of a target, with what can be asked instead: what the nearest rung surely reaches.
+
+    The next call pilots anew, and may take longer by the same margin as its job.
+    """
+    asked, sure = target.asked(), replace(nearest, spent=TIME_MARGIN * nearest.spent).surely()
     offered = {
         name: value if target.excess({**asked, name: sure[name]}) <= MET else _rounded(sure[name], up=name != "fps")
         for name, value in asked.items()

@@ -1,6 +1,7 @@
 """Targets instead of settings as a user meets them: chosen by a pilot, stated in the report, refused with an offer."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,6 +88,23 @@ def test_reconstruction(captured, tmp_path, capsys):
     assert asked[-1] == (chosen["gaussians"], chosen["preset"])
     assert beam(*words, "--target-seconds", 1e6, "--gaussians", 80) == 0
     assert said(capsys)["target"]["chosen"]["gaussians"] == 80  # what is stated stays
+
+
+@pytest.mark.parametrize(("seconds", "is_met"), [(70, True), (60, False)])
+def test_pilots_end_when_their_part_of_the_time_is_over(
+    captured, tmp_path, monkeypatch, capsys, refused, seconds, is_met
+):
+    """Each fit takes 10 s: three tell the way of frames, the fourth is the cheapest setting's, whose job takes 20."""
+    capture, asked = captured
+    monkeypatch.setattr("beam_warp.cli.reconstruct.time", SimpleNamespace(perf_counter=lambda: 10.0 * len(asked)))
+    words = ("reconstruct", capture, "--out", tmp_path / "out", "--json", "--target-seconds", seconds)
+    if is_met:
+        assert beam(*words) == 0
+        assert said(capsys)["target"]["chosen"] == {"gaussians": 6250, "preset": "draft"}
+        assert len(asked) == 5
+    else:
+        refused(*words, says="target-seconds must be attainable, got 60: the nearest is 78")
+        assert len(asked) == 4
 
 
 @pytest.mark.parametrize(
