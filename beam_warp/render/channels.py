@@ -17,6 +17,7 @@ from beam_warp.image.files import display_image
 from beam_warp.image.metrics import block_means
 from beam_warp.image.panels import BACKGROUND, over_background
 from beam_warp.raster.channels import CHANNELS, RADIANCE, UNIT_CHANNELS, channel_layers
+from beam_warp.raster.drawn_part import drawn_part
 from beam_warp.raster.gbuffer import rasterize, rasterize_values
 from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
@@ -156,12 +157,15 @@ def see_channel(
         InvalidArrayError: The cloud lacks the channel.
     """
     require_choice("channel", name, DRAWABLE)
-    fine = camera.supersampled(require_count("samples", samples, 1, 16))
+    part = drawn_part(cloud, camera, options or RasterOptions())
+    fine = camera.cropped(*part).supersampled(require_count("samples", samples, 1, 16))
     if name != OBSERVABILITY:
         buffer = rasterize(cloud, fine, channels=(name,), options=options, device=device)
         is_display = name == RADIANCE and cloud.radiance_color_space == DISPLAY_SRGB
         means = PixelMeans.of(buffer, samples)
-        return SeenChannel(name, means.alpha, means.channels[name], is_display)
+        return SeenChannel(
+            name, part.placed(means.alpha, camera), part.placed(means.channels[name], camera), is_display
+        )
     if cloud.observability is None:
         raise InvalidArrayError(
             f"channel must be one that the cloud holds, got {name!r}, which it lacks "
@@ -172,7 +176,8 @@ def see_channel(
     alpha = block_means(seen.alpha, samples).astype(np.float32)
     values, weights = block_means(seen.values, samples).astype(np.float32), alpha[..., None]
     shares = np.divide(values, weights, out=np.zeros_like(values), where=weights > 0.0)
-    return SeenChannel(name, np.minimum(alpha, np.float32(1.0)), shares)
+    alpha = np.minimum(alpha, np.float32(1.0))
+    return SeenChannel(name, part.placed(alpha, camera), part.placed(shares, camera))
 
 
 def channel_range(cloud: GaussianCloud, name: str) -> tuple[float, float]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from beam_warp.raster.channels import ERROR_CHANNELS
+from beam_warp.raster.drawn_part import drawn_part
 from beam_warp.raster.gbuffer import rasterize
 from beam_warp.raster.pixel_means import PixelMeans
 from beam_warp.raster.records import RasterOptions
@@ -32,7 +33,17 @@ class DeferredFrames:
         self.decisive: tuple[Any, ...] = ("deferred", options, raster)
 
     def draw(self, shot: Shot, context: FrameContext) -> RenderedImage:
-        """Render one frame."""
+        """Render one frame; without triangles, the part of it that shows something."""
+        if shot.mesh is not None:
+            return self._drawn(shot)
+        camera = shot.camera
+        part = drawn_part(shot.cloud, camera, self._raster)
+        image = self._drawn(replace(shot, camera=camera.cropped(*part)))
+        layers = {name: part.placed(layer, camera) for name, layer in image.layers.items()}
+        return RenderedImage(part.placed(image.rgb, camera), part.placed(image.alpha, camera), layers)
+
+    def _drawn(self, shot: Shot) -> RenderedImage:
+        """Render a shot with the errors of what it shows."""
         image = self._renderer.draw(shot)
         names = [name for name in ERROR_CHANNELS if self._errors and getattr(shot.cloud, name) is not None]
         if not names or not len(shot.cloud):
