@@ -99,6 +99,7 @@ RECONSTRUCTION = (
     Constant(FIT + "FitOptions.weights.l1", "3DGS", "Weight of colour.", "only its ratio to the others counts"),
     Constant(FIT + "FitOptions.weights.ssim", "3DGS", "Weight of structural similarity."),
     Constant(FIT + "FitOptions.weights.alpha", ALL, "Weight of coverage."),
+    Constant(FIT + "FitOptions.weights.estimated", "walker, robot", "Part of it for estimates.", EXACT_MASKS, most=1.0),
     Constant(FIT + "FitOptions.weights.normal", ALL, "Weight of normals against the depth's."),
     Constant(FIT + "FitOptions.weights.normal_tolerance", ALL, "Angle of an edge [rad]."),
     Constant(FIT + "FitOptions.rates.positions", WALKER, "Step of positions, in distances of the cameras."),
@@ -156,12 +157,6 @@ RECONSTRUCTION = (
     ),
     Constant(SEEN_COLORS + "LEAST_COVERAGE", JUDGED, "Coverage below which a pixel's colour does not count.", most=1.0),
     Constant("beam_warp.reconstruction.targets:MATTE_SHARE", ALL, "Coverage's weight before a backdrop.", EXACT_MASKS),
-    Constant(
-        "beam_warp.reconstruction.targets:RECUT_SHARE",
-        "walker, robot",
-        "Coverage's weight in moved masks.",
-        EXACT_MASKS,
-    ),
     Constant("beam_warp.raster.resolution:SAMPLES_PER_SPACING", WALKER, "Samples on the distance of neighbours."),
     Constant("beam_warp.raster.resolution:MOST_SAMPLES", WALKER, "Largest side of a pixel's square of samples."),
     Constant("beam_warp.reconstruction.targets:CROP_MARGIN", JUDGED, "Pixels around the subject that are looked at."),
@@ -193,6 +188,9 @@ TRACKING = (
     Constant(TRACK + "TrackOptions.joints.weights.l1", "3DGS", "Weight of colour.", "only its ratio counts"),
     Constant(TRACK + "TrackOptions.joints.weights.ssim", "3DGS", "Weight of structural similarity."),
     Constant(TRACK + "TrackOptions.joints.weights.alpha", WALKER, "Weight of coverage."),
+    Constant(
+        TRACK + "TrackOptions.joints.weights.estimated", WALKER, "Part of it for estimates.", EXACT_MASKS, most=1.0
+    ),
     Constant(TRACK + "TrackOptions.joints.rigidity", WALKER, "Stiffness between joints."),
     Constant(TRACK + "TrackOptions.joints.rotation_rate", WALKER, "Step of joints' turns."),
     Constant(TRACK + "TrackOptions.joints.position_rate", WALKER, "Step of joints' positions, in their spacings."),

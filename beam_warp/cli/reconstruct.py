@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +21,7 @@ from beam_warp.cli.common.targets import TargetFlags, state
 from beam_warp.errors import InvalidOptionError
 from beam_warp.plan.crew import AUTO, crew_of
 from beam_warp.study.table import Settings
-from beam_warp.study.targets import PILOT_PART, Rung, Target, cheapest, climbed, fitted, in_words
+from beam_warp.study.targets import Rung, Target, cheapest, climbed, fitted, in_words
 from beam_warp.world.environment import EnvironmentMap
 
 if TYPE_CHECKING:
@@ -209,13 +210,10 @@ def modelling_for(target: Target, modelling: Modelling, asked: Asked, started: f
 
         if target.error is not None or len(ladder) <= PILOTS:
             return cheapest(climbed(ladder, measure, target, elapsed), target)
-        known: list[Rung] = []
-        for settings in ladder[:PILOTS]:
-            known.append(measure(settings, **as_long))
-            if not target.meets(known[-1]) or elapsed() > PILOT_PART * (target.seconds or math.inf):
-                break
+        # The next of these takes less than twice as long: it is begun as long as there is time at all.
+        known = climbed(ladder[:PILOTS], partial(measure, **as_long), target, elapsed, growth=0.0)
         if len(known) < PILOTS:  # no time to learn what others cost
-            return cheapest([replace(one, spent=elapsed()) for one in known], target)
+            return cheapest(known, target)
 
         def cost(settings: Settings) -> list[float]:
             fit = FitOptions.of_preset(str(settings["preset"]))

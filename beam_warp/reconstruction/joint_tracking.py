@@ -70,7 +70,7 @@ class JointOptions:
 
     levels: tuple[int, ...] = (8, 4, 2, 1)
     iterations: tuple[int, ...] = (200, 200, 150, 200)
-    weights: LossWeights = field(default_factory=lambda: LossWeights(alpha=1.0))
+    weights: LossWeights = field(default_factory=lambda: LossWeights(estimated=1.0))
     rigidity: float = 1.0
     rotation_rate: float = 5e-3
     position_rate: float = 3e-2

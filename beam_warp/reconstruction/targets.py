@@ -41,9 +41,8 @@ CROP_MARGIN = 8
 CROP_STEP = 16
 """Sides of crops are multiples of a tile of the rasteriser [pixel]."""
 
-MATTE_SHARE, RECUT_SHARE = 0.2, 0.5
-"""Parts of the weight of coverage that count where it is an estimate: of a matte before a known backdrop, where the
-photograph says what the matte guesses, and of a cut-out whose mask was moved."""
+MATTE_SHARE = 0.4
+"""Part of the weight of coverage that counts where the backdrop is known: the photograph says what a matte guesses."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +56,7 @@ class LossWeights:
         normal: Disagreement of the Gaussians' normals with those of the drawn depth.
         normal_tolerance: Angle from which on it counts no more by its square [rad], see
             `beam_warp.raster.losses.NormalLoss`; None: always by its square (BEAM Eq. 2).
+        estimated: Part of ``alpha`` that counts where coverage is an estimate, of a matte or of a mask that was moved.
 
     Raises:
         InvalidOptionError: A weight is negative or no number, or the tolerance is not above 0.
@@ -67,10 +67,11 @@ class LossWeights:
     alpha: float = 1.0
     normal: float = 0.0
     normal_tolerance: float | None = None
+    estimated: float = 0.5
 
     def __post_init__(self) -> None:
         """Check every weight once; a term that counts 0 is left out, and NaN must not pass for it."""
-        for name in ("l1", "ssim", "alpha", "normal"):
+        for name in ("l1", "ssim", "alpha", "normal", "estimated"):
             require_number(name, getattr(self, name), 0.0)
         if self.normal_tolerance is not None and not self.normal_tolerance > 0.0:
             raise InvalidOptionError(
@@ -160,7 +161,7 @@ class ViewTargets:
         self._alphas = [
             None if view.alpha is None else upload(view.alpha[..., None], float, self.device) for view in views
         ]
-        self._shares = [_share_of_coverage(view) for view in views]
+        self._are_estimates = [view.uncut is not None or view.is_recut for view in views]
         self._doubts = [None if view.doubt is None else upload(view.doubt, float, self.device) for view in views]
         self._subjects = [
             self.height * self.width if view.alpha is None else int((view.alpha > 0.5).sum()) for view in views
@@ -210,7 +211,7 @@ class ViewTargets:
     def kind(self, index: int) -> Hashable:
         """Return what views have in common that are compared by the same launches, when each was selected before."""
         parts = (self._alphas, self._doubts, self._backdrops)
-        return self, self._shares[index], *(of[index] is None for of in parts)
+        return self, self._are_estimates[index], *(of[index] is None for of in parts)
 
     def move_camera(self, index: int, camera: Camera) -> None:
         """Draw a view from another camera from now on.
@@ -253,7 +254,8 @@ class ViewTargets:
             self._to_covered.zero_()
             launch_average(self._alpha, self.samples, False, self._covered, self.device)
             launch_believe(doubt, alpha, self._covered, self.device)
-            weight = weights.alpha * self._shares[index]
+            weight = weights.alpha * (1.0 if self._backdrops[index] is None else MATTE_SHARE)
+            weight *= weights.estimated if self._are_estimates[index] else 1.0
             terms.append(self._l1_alpha(self._covered, alpha, weight=weight, gradient=self._to_covered, value=values))
             launch_believe(doubt, None, self._to_covered, self.device)
             launch_add_sample_gradients(self._alpha, self.samples, False, self._to_covered, self._to_alpha, self.device)
@@ -368,13 +370,6 @@ class ViewTargets:
         parts, count = labelled
         largest = np.bincount(parts.ravel())[1:].max() if count else 0
         return largest / max(self._subjects[index], 1)
-
-
-def _share_of_coverage(view: CapturedView) -> float:
-    """Return the part of the weight of coverage that counts in a view."""
-    if view.uncut is not None:
-        return MATTE_SHARE
-    return RECUT_SHARE if view.is_recut else 1.0
 
 
 def _encoded(color: NDArray[np.float32], device: Any) -> wp.array:

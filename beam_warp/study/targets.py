@@ -157,6 +157,7 @@ def climbed(
     measure: Callable[[Settings], Rung],
     target: Target,
     elapsed: Callable[[], float] = lambda: 0.0,
+    growth: float = GROWTH,
 ) -> list[Rung]:
     """Measure a ladder from its cheapest setting up, as far as a target needs and its time allows.
 
@@ -168,6 +169,7 @@ def climbed(
         measure: Measures one.
         target: What is asked.
         elapsed: Returns the time since the command began [s].
+        growth: How many times as long as the last rung the next one may take to measure.
     """
     others = Target(seconds=target.seconds, fps=target.fps)
     found: list[Rung] = []
@@ -179,7 +181,7 @@ def climbed(
         if not others.meets(last) or (target.error is not None and target.meets(last)):
             break
         part = PILOT_PART if target.error is None else 1.0
-        if target.seconds is not None and now + GROWTH * (now - before) > part * target.seconds:
+        if target.seconds is not None and now + growth * (now - before) > part * target.seconds:
             break
     spent = elapsed()
     return [replace(rung, spent=spent) for rung in found]

@@ -412,7 +412,7 @@ OUT_OF_RANGE = {
     LearningRates: dict.fromkeys(
         ("positions", "final_positions", "orientations", "scales", "color", "bands"), (-0.1, np.nan, "fast")
     ),
-    LossWeights: dict.fromkeys(("l1", "ssim", "alpha", "normal"), (-0.1, np.nan, "much")),
+    LossWeights: dict.fromkeys(("l1", "ssim", "alpha", "normal", "estimated"), (-0.1, np.nan, "much")),
 }
 
 

@@ -24,7 +24,6 @@ from beam_warp.reconstruction.targets import (
     CROP_MARGIN,
     CROP_STEP,
     MATTE_SHARE,
-    RECUT_SHARE,
     LossWeights,
     TargetSet,
     ViewTargets,
@@ -194,7 +193,7 @@ class Twin:
         if self.view.uncut is not None:
             target = self.view.uncut.scene.astype(np.float64)
             linear = linear + (1.0 - covered) * self.view.uncut.behind.astype(np.float64)
-            share = MATTE_SHARE
+            share = self.weights.estimated * MATTE_SHARE
         color, target = encode(linear), linear_to_srgb(target)
         trust = (everywhere if self.view.doubt is None else 1.0 - self.view.doubt.astype(np.float64))[..., None]
         color = target + trust * (color - target)
@@ -270,10 +269,10 @@ def test_coverage_that_is_an_estimate_counts_less(device):
     for given in (wrong, before, replace(wrong, is_recut=True)):
         targets, parameters = set_up([given], cloud, device, kind=ViewTargets)
         targets.draw(0, parameters.drawn)
-        targets.add_losses(0, LossWeights(l1=1.0, ssim=0.2, alpha=1.0))
+        targets.add_losses(0, LossWeights(l1=1.0, ssim=0.2, alpha=1.0, estimated=0.7))
         pulls.append(targets.rasterizer.adjoints().alpha.numpy())
     assert np.abs(pulls[0]).sum() > 0.0
-    for share, found in ((MATTE_SHARE, pulls[1]), (RECUT_SHARE, pulls[2])):
+    for share, found in ((0.7 * MATTE_SHARE, pulls[1]), (0.7, pulls[2])):
         np.testing.assert_allclose(found, share * pulls[0], atol=0.02 * np.abs(pulls[0]).max())
     together = ViewTargets([wrong, replace(wrong, is_recut=True)], len(cloud), RASTER, 1, device)
     assert together.kind(0) != together.kind(1)  # a recorded step has the share of its kind
